@@ -1,4 +1,4 @@
-"""Sub-boxes of a set of poses: how the box of parameters is cut."""
+"""Cuts the box of parameters of a pose set into sub-boxes."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ class SubBox(NamedTuple):
 
 
 class BoxSplitter:
-    """Cuts the box of a frame's parameters; boxes narrower than the part ``narrowest`` of the set are not cut."""
+    """Cuts the box of a frame's parameters; boxes narrower than the fraction ``narrowest`` of the set are not cut."""
 
     def __init__(self, frame: Frame, narrowest: float) -> None:
         self.frame, self.narrowest = frame, narrowest
@@ -31,7 +31,7 @@ class BoxSplitter:
         return SubBox(box, np.ones(box.dimensions, bool), np.ones(box.dimensions, bool))
 
     def cut(self, part: SubBox, axis: int, count: int = 2) -> list[SubBox]:
-        """What ``count`` equal parts of ``part`` along ``axis`` hold of the set, without those that hold nothing."""
+        """Return ``count`` equal parts of ``part`` along ``axis``, reduced to poses of the set, without empty ones."""
         whole, parts = part.box, []
         for box in whole.split(axis, count):
             inside = self.frame.feasible(box)
@@ -42,11 +42,11 @@ class BoxSplitter:
         return parts
 
     def cut_all(self, parts: list[SubBox], axis: int) -> list[SubBox]:
-        """The halves of all ``parts`` along ``axis``."""
+        """Return the halves of all ``parts`` along ``axis``."""
         return [half for part in parts for half in self.cut(part, axis)]
 
     def halved(self, part: SubBox, slopes: np.ndarray, count: int) -> list[SubBox]:
-        """Up to ``count`` parts, from halving ``part`` again and again along the axis of the largest of ``slopes``."""
+        """Return up to ``count`` parts by halving ``part`` repeatedly along the axis of the largest of ``slopes``."""
         if part.box.dimensions == 1:
             return self.cut(part, 0, count)
         parts, slopes = [part], slopes.copy()
@@ -57,7 +57,7 @@ class BoxSplitter:
         return parts
 
     def steepest_axis(self, box: ParameterBox, slopes: np.ndarray) -> int:
-        """The axis that the picture varies most along, of those that can be halved."""
+        """Return the axis along which the picture varies most, of those that can be halved."""
         slopes = np.nan_to_num(slopes, nan=0.0, posinf=float(np.finfo(np.float64).max))
         # a parameter that only moves what the linear part does not see still has to be split
         if not np.any(slopes > 0.0):
@@ -65,11 +65,11 @@ class BoxSplitter:
         return int(np.argmax(np.where(self._narrow_axes(box), -1.0, slopes)))
 
     def is_narrow(self, box: ParameterBox) -> bool:
-        """Whether no axis can be halved sensibly; true of a single pose."""
+        """Return whether no axis can be halved sensibly; true for a single pose."""
         return bool(self._narrow_axes(box).all())
 
     def _narrow_axes(self, box: ParameterBox) -> np.ndarray:
-        """[d] whether an axis cannot be halved sensibly."""
+        """Return [d] whether an axis cannot be halved sensibly."""
         root = self.frame.box
         width, whole = np.array(box.upper) - np.array(box.lower), np.array(root.upper) - np.array(root.lower)
         return width <= self.narrowest * whole

@@ -1,4 +1,4 @@
-"""The absolute difference of two scenes' pictures as a frame of its own (design.md, Y1-Y3)."""
+"""The absolute difference of two scenes' pictures as a frame of its own (docs/dev/design.md, Y1-Y3)."""
 
 from __future__ import annotations
 
@@ -31,34 +31,34 @@ _MOST_PIXELS = 64
 
 @dataclass(frozen=True)
 class PairContext:
-    """The contexts of both scenes for the cells inside one."""
+    """The contexts of both scenes for cells inside one cell."""
 
     first: CellContext | None
     second: CellContext | None
 
     @property
     def nbytes(self) -> int:
-        """Memory that both hold."""
+        """Bytes of both."""
         return sum(context.nbytes for context in (self.first, self.second) if context is not None)
 
     @property
     def shown(self) -> None:
-        """Elements of two scenes have no common numbers."""
+        """None: elements of two scenes have no common numbers."""
         return None
 
 
 class DifferenceFrame(Frame):
-    """Renders and bounds of |A - B| by pixel and channel, for two frames with the same parameters (design.md, Y4).
+    """Renders and bounds |A - B| by pixel and channel, for two frames with the same parameters (design.md, Y4).
 
-    Nothing is left out by a tolerance: what is dim in both pictures is not the same.
+    Nothing is left out by a tolerance: light that is dim in both pictures may still differ.
 
     Args:
         first, second: The frames of A and B, of the same set of poses, camera and tiles.
-        floor: Values up to it are taken for it, in renders and bounds alike, so that nothing below is refined.
+        floor: Smaller values are raised to it, in renders and bounds alike, so that they are not refined.
 
     Attributes:
-        largest: The largest value of the image that was rendered; None before the first render.
-        greatest: [T, side, side, 3] float32, the greatest values rendered by this frame and those `above` a floor.
+        largest: The largest rendered value of the image; None before the first render.
+        greatest: [T, side, side, 3] float32, the greatest values rendered by this frame and those made by `above`.
     """
 
     channels = COLORS
@@ -84,18 +84,18 @@ class DifferenceFrame(Frame):
         return self.first, self.second
 
     def above(self, floor: float) -> DifferenceFrame:
-        """The same with another floor."""
+        """Return the same frame with another floor."""
         frame = copy.copy(self)
         frame.floor, frame.largest = np.float32(floor), None
         return frame
 
     @property
     def shares_order(self) -> bool:
-        """Whether elements of both scenes are taken to be drawn in one order (design.md, Y5)."""
+        """Whether elements of both scenes are bounded in a common depth order (docs/dev/design.md, Y5)."""
         return self._shared is not None
 
     def warm_up(self, stage: str | None = None) -> None:
-        """Compile what both frames need, with linear bounds."""
+        """Compile the kernels of both frames, with those of linear bounds."""
         for frame in self.both:
             if stage is None or stage in frame.stages:
                 frame.warm_up(stage)
@@ -104,7 +104,7 @@ class DifferenceFrame(Frame):
             self.bound(self.box, np.arange(1))
 
     def render(self, values: np.ndarray, tiles: np.ndarray | None = None) -> np.ndarray:
-        """Tiles [t, side, side, 3] float32 of |A - B| at parameter values [d], rounded down, at least the floor."""
+        """Return tiles [t, side, side, 3] float32 of |A - B| at parameter values [d], rounded down, at least floor."""
         check_cancelled()
         (first, one), (second, other) = (_picture(frame, values, tiles) for frame in self.both)
         difference = np.abs(first - second) * (1.0 - DIFFERENCE_ROUNDING) - (one + other)
@@ -146,7 +146,7 @@ class DifferenceFrame(Frame):
         contexts: tuple[CellContext | None, CellContext | None],
         pixels: np.ndarray | None,
     ) -> None:
-        """Lower bounds above the floor where both scenes are drawn in one order, whichever it is (design.md, Y5)."""
+        """Tighten bounds above the floor where both scenes have one depth order, whichever it is (Y5)."""
         assert self._shared is not None
         wanted = self._inside[tiles] & (difference.upper > self.floor).any(axis=-1)
         wanted &= True if pixels is None else pixels
@@ -163,7 +163,7 @@ class DifferenceFrame(Frame):
             difference.upper[k][lower] = np.maximum(high, self.floor)[lower]
 
     def _difference(self, a: Bounds, b: Bounds, pixels: np.ndarray | None) -> Bounds:
-        """Bounds of one cell from those of both scenes."""
+        """Return bounds of one cell from those of both scenes."""
         upper = upper_of(a, b)
         _, high = outward(upper, upper)
         # what is not a number stays so, and is no bound
@@ -177,23 +177,23 @@ class DifferenceFrame(Frame):
         return self.first.feasible(box)
 
     def motion(self, box: ParameterBox) -> np.ndarray:
-        """[d] pixels that the picture of either scene moves by over each parameter's range (an estimate)."""
+        """Return the estimated motion [d] in pixels of either scene's picture over each parameter's range."""
         return np.maximum(self.first.motion(box), self.second.motion(box))
 
     def depths(self) -> np.ndarray | None:
-        """Depths of elements of A."""
+        """Return depths of elements of A."""
         return self.first.depths()
 
 
 def _picture(frame: Frame, values: np.ndarray, tiles: np.ndarray | None) -> tuple[np.ndarray, float]:
-    """Colours of a render in float64, and by how much each may be rounded."""
+    """Return the colours of a render in float64, and their rounding error."""
     if isinstance(frame, PreciseFrame):
         return frame.precise(values, tiles)[..., :COLORS], RENDERED_DIGITS
     return frame.render(values, tiles)[..., :COLORS].astype(np.float64), UNIT32
 
 
 def upper_of(a: Bounds, b: Bounds) -> np.ndarray:
-    """The least upper bound [...] of |a - b| over a cell that is known; NaN: none is."""
+    """Return the least known upper bound [...] of |a - b| over a cell; NaN: none is known."""
     upper = np.maximum(interval_upper(a, b), interval_upper(b, a))
     for more in (linear_upper(a, b), form_upper(a, b, a.slopes.size)):
         upper = np.minimum(upper, more)
@@ -201,19 +201,19 @@ def upper_of(a: Bounds, b: Bounds) -> np.ndarray:
 
 
 def interval_upper(a: Bounds, b: Bounds) -> np.ndarray:
-    """Upper bound [...] of the signed difference a - b from intervals; NaN: nothing is known (design.md, Y1)."""
+    """Return an upper bound [...] of the signed difference a - b by intervals; NaN: none is known (Y1)."""
     return (a.upper.astype(np.float64) - b.lower) * (1.0 + DIFFERENCE_ROUNDING)
 
 
 def linear_upper(a: Bounds, b: Bounds) -> np.ndarray:
-    """Upper bound [...] of |a - b| over a cell from linear bounds in the same parameters (design.md, Y2)."""
+    """Return an upper bound [...] of |a - b| over a cell by linear bounds in the same parameters (Y2)."""
     if a.linear is None or b.linear is None:
         return np.full(a.upper.shape, np.inf)
     return np.maximum(_signed_upper(a.linear, b.linear), _signed_upper(b.linear, a.linear))
 
 
 def _signed_upper(a: LinearSets, b: LinearSets) -> np.ndarray:
-    """Largest value over the cell of the upper bound of a minus the lower bound of b."""
+    """Return the largest value over the cell of the upper bound of a minus the lower bound of b."""
     slope_low, low = (part.astype(np.float64) for part in b[:2])
     slope_high, high = (part.astype(np.float64) for part in a[2:])
     # a linear function is largest in a corner of [-1, 1]^d
@@ -223,9 +223,9 @@ def _signed_upper(a: LinearSets, b: LinearSets) -> np.ndarray:
 
 
 def form_upper(a: Bounds, b: Bounds, dimensions: int) -> np.ndarray:
-    """Upper bound [...] of |a - b| over a cell from polynomials in the same parameters (design.md, Y3).
+    """Return an upper bound [...] of |a - b| over a cell by polynomials in the same parameters (Y3).
 
-    Equal terms of the two cancel, and the clamp to [0, 1] takes no values apart.
+    Equal terms of the two cancel, and the clamp to [0, 1] moves no two values apart.
     """
     if a.forms is None or b.forms is None:
         return np.full(a.upper.shape, np.inf)
@@ -238,7 +238,7 @@ def form_upper(a: Bounds, b: Bounds, dimensions: int) -> np.ndarray:
 
 
 def _polynomial_upper(coefficients: np.ndarray, d: int) -> np.ndarray:
-    """At most the largest value over [-1, 1]^d of polynomials [..., m + 1], whose last column is left out."""
+    """Return an upper bound over [-1, 1]^d of polynomials [..., m + 1] without their last column, the radius."""
     most, row = coefficients[..., 0].copy(), 1 + d
     squares = np.zeros((*most.shape, d))
     if coefficients.shape[-1] > d + 2:

@@ -1,7 +1,7 @@
-"""Anytime two-sided refinement of one frame (design.md, R1-R4).
+"""Anytime refinement of one frame, with outer and inner bounds (docs/dev/design.md, R1-R4).
 
-The set is covered by cells. Every (cell, tile) pair is a leaf with an outer bound; real renders give an inner one. The
-leaves that leave most open beyond it are split until the ratio of outer to inner gap is reached or the time is over.
+The set is covered by cells. Every (cell, tile) pair is a leaf with an outer bound; renders give the inner bound. The
+leaves with the largest excess are split until the target ratio of outer to inner gap is reached or the time is over.
 The order of splits depends on bounds only, so the result after a number of cells is the same on every machine.
 """
 
@@ -38,19 +38,19 @@ class Refinement:
     """Refines one frame.
 
     Args:
-        progress: Called with (trace point, covered part of the set) after every initial cell and after every round.
+        progress: Called with (trace point, covered fraction of the set) after every initial cell and every round.
         scene_samples: Where the scene varies too: other scenes of the set, each as a function like the frame's
             ``render``. They widen the inner bound; only poses are split.
-        tiles: Numbers of the tiles that are looked at, ascending; None: all. Measures are those of its pixels (R6).
-        earlier: What was found of the same set before, with bounds: results are no looser, and work goes where it
-            leaves most open. Not where leaves are kept: these are to be as tight as the result.
-        initial: Takes the cells of the initial partition with their bounds in these tiles; where it holds some, they
-            are the initial partition.
+        tiles: Numbers of the refined tiles, ascending; None: all. Measures are those of their pixels (R6).
+        earlier: An earlier result of the same set, with bounds: results are no looser, and work goes where it has the
+            largest excess. Not where leaves are kept: these are to be as tight as the result.
+        initial: Takes the cells of the initial partition with their bounds in these tiles; if it holds some, they are
+            the initial partition.
 
     Attributes:
-        covered: Whether the initial partition is bounded; nothing but [0, 1] is known before.
+        covered: Whether the initial partition is bounded; before, only [0, 1] is known.
         shown: Scene elements that some initial cell shows, if the frame tells.
-        floor: What no more light comes to is left out of the initial cells.
+        floor: Light up to this amount is left out of the initial cells.
     """
 
     def __init__(
@@ -100,12 +100,12 @@ class Refinement:
     # --- measures ------------------------------------------------------------------------------
 
     def point(self) -> TracePoint:
-        """Where the work stands."""
+        """Return the present state as a trace point."""
         seconds = time.perf_counter() - self.start
         return TracePoint(seconds, self.cells, self.leaves.mean_gap, self.inner.mean_gap)
 
     def _record(self, share: float, keep: bool = True) -> TracePoint:
-        """Report where the work stands; ``share`` of the set is covered."""
+        """Report the present state; ``share`` of the set is covered."""
         point = replace(self.point(), covered=share)
         if keep:
             self.trace.append(point)
@@ -124,26 +124,26 @@ class Refinement:
     # --- the work ------------------------------------------------------------------------------
 
     def run(self) -> FrameResult:
-        """Refine until the goal is reached; sound whenever it ends.
+        """Refine until the goal is reached, and return the result; it is sound whenever it ends.
 
         Raises:
-            WorkCancelledError: ``stopped`` was true before a first picture was there.
+            WorkCancelledError: ``stopped`` was true before there was a first picture.
         """
         return self._result(self._work())
 
     def run_part(self) -> PartResult:
-        """`run` for tiles that are to be put beside others."""
+        """Do `run` for tiles that are later joined with others."""
         return self._part_result(self._work())
 
     def proceed(self, goal: RefinementGoal) -> FrameResult:
-        """Go on after `run` has covered the set; time between the two does not count."""
+        """Continue after `run` has covered the set; time between the two does not count."""
         self.goal = goal
         self.start = time.perf_counter() - self.trace[-1].seconds
         self._refine()
         return self._result(self._record(1.0))
 
     def snapshot(self) -> FrameResult:
-        """What is known now; sound at any time after the first render."""
+        """Return the result so far; sound at any time after the first render."""
         return self._result(self.point())
 
     def _work(self) -> TracePoint:
@@ -165,7 +165,7 @@ class Refinement:
         return self._record(1.0 if self.covered else self.trace[-1].covered)
 
     def _begin(self) -> np.ndarray:
-        """Render what the initial partition asks for; returns the corners of the set that are left for later."""
+        """Render what the initial partition needs; return the corners of the set that are left for later."""
         corners, dimensions = self.inner.corners(), self.frame.box.dimensions
         if self.frame.tilewise and dimensions != 1:
             return corners
@@ -184,7 +184,7 @@ class Refinement:
     def _bound(
         self, cells: list[LeafCell], parent: LeafCell | None, places: np.ndarray, pixels: np.ndarray | None = None
     ) -> list[tuple[np.ndarray, np.ndarray, Bounds]]:
-        """Of each cell, usable lower and upper bounds [t, side, side, channels], and all that the frame returned."""
+        """Return usable lower and upper bounds [t, side, side, channels] of each cell, and the frame's `Bounds`."""
         bounds = self.tiles.bound(cells, parent, places, pixels)
         return [self._take(*both) for both in zip(cells, bounds, strict=True)]
 
@@ -195,7 +195,7 @@ class Refinement:
         return (*usable(bounds.lower, bounds.upper), bounds)
 
     def _cover(self) -> bool:
-        """Bound an initial partition of the set; False if the work was stopped first."""
+        """Bound an initial partition of the set; return False if the work was stopped first."""
         if self.initial:
             for leaf in self.initial:
                 self.leaves.take(*leaf)
@@ -235,14 +235,14 @@ class Refinement:
         return self._covered(cells)
 
     def _may_be_late(self) -> bool:
-        """Whether a cell may take longer than there is time for, by what a picture takes."""
+        """Return whether a cell may take longer than the remaining time, estimated from a render."""
         longest = self.tuning.most_cell_pictures * self.inner.picture_seconds
         return not self.frame.tilewise and longest > self.goal.seconds and self.tiles.count >= self.tuning.cover_groups
 
     def _cell_in_groups(self) -> BoundedCell | None:
-        """The whole set as a cell, bounded in one group of tiles after another until the time is over (R6).
+        """Return the whole set as a cell, bounded in one group of tiles after another until the time is over (R6).
 
-        Nothing is known of the tiles that are left. None: the first group says that there is time for all at once.
+        Tiles that are left stay at [0, 1]. None: by the first group there is time for all tiles at once.
         """
         cell, begin = self._cell(self.splitter.whole), time.perf_counter()
         left = max(self.start + self.goal.seconds - begin, 0.0)
@@ -272,7 +272,7 @@ class Refinement:
         return cell, *usable(lower, upper)
 
     def _covered(self, cells: list[LeafCell]) -> bool:
-        """Go on with ``cells`` that cover the set and whose bounds the leaves have; returns True."""
+        """Continue with ``cells`` that cover the set, whose bounds the leaves have; return True."""
         self.leaves.cover()
         self.covered = True
         elements = [None if cell.context is None else cell.context.shown for cell in cells]
@@ -283,7 +283,7 @@ class Refinement:
         return True
 
     def _initial_cell(self, part: SubBox, partition: Partition | None) -> BoundedCell:
-        """Take a cell of the initial partition and its bounds, which are computed unless ``partition`` tried them."""
+        """Return a cell of the initial partition with its bounds, computed unless ``partition`` has tried them."""
         cell, everything = self._cell(part), self.tiles.all
         if partition is not None and part.box == partition.tried.box:
             lower, upper, bounds = self._take(cell, partition.bounds)
@@ -301,7 +301,7 @@ class Refinement:
                 pass
 
     def _round(self) -> bool:
-        """Render or split what leaves most open; False if the goal is reached, or nothing more can be done."""
+        """Render or split the leaves of largest excess; return False if the goal is reached, or nothing can be done."""
         point = self._record(1.0)
         if self._over() or self.goal.met(point):
             return False
@@ -342,7 +342,7 @@ class Refinement:
         return True
 
     def _split(self, cell: LeafCell, rows: dict[int, int], parts: int, changes: dict[int, Change]) -> int:
-        """Bound the parts of ``cell`` in the tiles of ``rows``; returns the bytes of the new leaves."""
+        """Bound the parts of ``cell`` in the tiles of ``rows``; return the bytes of the new leaves."""
         places = np.array(list(rows), np.int64)
         pixels = self.leaves.wanted(rows)
         children = [self._cell(part) for part in self.splitter.halved(cell.part, cell.slopes, parts)]
@@ -404,9 +404,9 @@ class Refinement:
 
 
 def groups(frame: Frame, count: int) -> list[np.ndarray]:
-    """The frame's tiles in ``count`` parts of equal number, fewer where there are fewer tiles.
+    """Return the frame's tiles in ``count`` groups of equal number, fewer where there are fewer tiles.
 
-    Runs of tiles show few scene elements each; where every ray is a tile, every ``count``-th one makes parts alike.
+    Adjacent tiles show few scene elements each; where every ray is a tile, every ``count``-th one makes groups alike.
     """
     count = max(1, min(count, frame.tile_count))
     everything = np.arange(frame.tile_count)
@@ -416,9 +416,9 @@ def groups(frame: Frame, count: int) -> list[np.ndarray]:
 
 
 def shared_goal(frame: Frame, index: int, goal: RefinementGoal, seed: int) -> RefinementGoal:
-    """A goal for each of several parts of a frame: where all reach theirs, the whole frame reaches ``goal`` (R6).
+    """Return a goal for each group of a frame's tiles: if all groups reach theirs, the frame reaches ``goal`` (R6).
 
-    Parts that hardly move would never come near a ratio; they may miss it by what the others stay below it.
+    Groups that hardly move would never come near a ratio; they may miss it by what the others stay below it.
     """
     if frame.tilewise or not frame.box.dimensions:
         return goal

@@ -1,4 +1,4 @@
-"""The tiles of a frame that one refinement bounds, and the cells that they are bounded over."""
+"""The tiles of a frame that one refinement bounds, and the cells over which they are bounded."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from ns_abstract.refine.result import gap
 
 
 class LeafCell:
-    """A sub-box of the set, the context for cells inside it, and how much the picture varies along each axis [d]."""
+    """A sub-box of the set, the context for cells inside it, and the picture's variation along each axis [d]."""
 
     __slots__ = ("context", "narrow", "number", "part", "slopes")
 
@@ -24,7 +24,7 @@ class LeafCell:
 
     @property
     def box(self) -> ParameterBox:
-        """Its range of parameters."""
+        """The box of parameters."""
         return self.part.box
 
 
@@ -40,50 +40,50 @@ class FrameTiles:
 
     @property
     def shape(self) -> tuple[int, int, int]:
-        """Of one tile's values."""
+        """The shape of one tile's values."""
         return self.frame.side, self.frame.side, self.frame.channels
 
     @property
     def by_pixel(self) -> bool:
-        """Whether cells may be split for some of their pixels only: not where linear sets or layers are kept."""
+        """Whether cells may be split for some of their pixels only: not if linear sets or further outputs are kept."""
         return not self.keep_linear and self.frame.channels == COLORS
 
     def numbers(self, places: np.ndarray | None) -> np.ndarray:
-        """The frame's numbers of tiles; of all of these if None."""
+        """Return the frame's numbers of the tiles at ``places``; None: of all."""
         if self.selected is None:
             return self.all if places is None else places
         return self.selected if places is None else self.selected[places]
 
     def filled(self, value: float) -> np.ndarray:
-        """[t, side, side, channels] float32 of one value."""
+        """Return [t, side, side, channels] float32 filled with one value."""
         return np.full((self.count, *self.shape), value, np.float32)
 
     def render(self, render: Callable[..., np.ndarray], values: np.ndarray, places: np.ndarray | None) -> np.ndarray:
-        """Tiles at ``places`` (None: all) as ``render`` shows them at parameter values [d]."""
+        """Return tiles at ``places`` (None: all) rendered by ``render`` at parameter values [d]."""
         whole = self.selected is None and places is None
         return render(values, None if whole else self.numbers(places))
 
     def bound(
         self, cells: Sequence[LeafCell], parent: LeafCell | None, places: np.ndarray, pixels: np.ndarray | None = None
     ) -> Sequence[Bounds]:
-        """Bounds of each cell in the tiles at ``places``.
+        """Return bounds of each cell in the tiles at ``places``.
 
         Args:
             parent: A cell that was bounded in these tiles before, or None.
-            pixels: [t, side, side] which pixels are wanted, of those that were wanted of ``parent``; None: all.
+            pixels: [t, side, side] which pixels are needed, of those that were needed of ``parent``; None: all.
         """
         within = None if parent is None else parent.context
         boxes, numbers = [cell.box for cell in cells], self.numbers(places)
         return self.frame.bound_parts(boxes, numbers, within, self.keep_linear, pixels)
 
     def mean_gap(self, lower: np.ndarray, upper: np.ndarray, places: np.ndarray | None = None) -> float:
-        """MPG between [t, side, side, channels] values of the tiles at ``places`` [t]; None: all."""
+        """Return the MPG between values [t, side, side, channels] of the tiles at ``places`` [t]; None: all."""
         inside = self.inside if places is None else self.inside[places]
         return float(gap(lower[..., :COLORS], upper[..., :COLORS])[inside].mean())
 
 
 def pixels_inside(frame: Frame) -> np.ndarray:
-    """[T, side, side] whether a tile's pixel belongs to the image."""
+    """Return [T, side, side] whether a tile's pixel belongs to the image."""
     rows = np.arange(frame.down * frame.side) < frame.camera.height
     columns = np.arange(frame.across * frame.side) < frame.camera.width
     grid = (rows[:, None] & columns[None, :]).reshape(frame.down, frame.side, frame.across, frame.side)
@@ -91,7 +91,7 @@ def pixels_inside(frame: Frame) -> np.ndarray:
 
 
 def usable(lower: np.ndarray, upper: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Bounds within [0, 1], depths from 0 on; where they are not finite, cross or miss that, nothing is known."""
+    """Return bounds clipped to [0, 1], depths to 0 on; those that are not finite, cross or miss it become unknown."""
     if lower.shape[-1] <= DEPTH and bool((lower >= 0.0).all() and (lower <= upper).all() and (upper <= 1.0).all()):
         return lower, upper
     good = np.isfinite(lower) & np.isfinite(upper) & (lower <= upper) & (lower <= 1.0) & (upper >= 0.0)
@@ -105,5 +105,5 @@ def usable(lower: np.ndarray, upper: np.ndarray) -> tuple[np.ndarray, np.ndarray
 
 
 def context_bytes(context: CellContext | None) -> int:
-    """Memory that a context holds."""
+    """Return the bytes of a context."""
     return 0 if context is None else context.nbytes

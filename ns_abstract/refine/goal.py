@@ -1,4 +1,4 @@
-"""When a refinement is good enough, what it may use and what it keeps."""
+"""The goal of a refinement: when bounds are tight enough, its limits, and what the result keeps."""
 
 from __future__ import annotations
 
@@ -12,12 +12,12 @@ class RefinementGoal:
     """When to stop, and what to keep.
 
     Attributes:
-        ratio: MPG over witness MPG that is good enough.
+        ratio: Target of MPG over witness MPG.
         seconds: Time budget of the frame.
         cells: Largest number of cells, or None (for reproducible runs).
-        leaf_bytes: Memory that open leaves, or the linear sets that are kept of all leaves, may take.
-        slack: MPG beyond ``ratio`` times the witness MPG that is good enough, too.
-        keep_leaves: Whether the result carries the leaves' linear sets.
+        leaf_bytes: Largest memory of open leaves, or of the linear sets of all leaves if they are kept.
+        slack: MPG beyond ``ratio`` times the witness MPG that is also accepted.
+        keep_leaves: Whether the result keeps the leaves' linear sets.
     """
 
     ratio: float = 1.05
@@ -28,9 +28,9 @@ class RefinementGoal:
     keep_leaves: bool = False
 
     def excess(self, mpg_witness: float) -> float:
-        """MPG beyond the witness MPG that is good enough."""
+        """Return the accepted MPG beyond the witness MPG."""
         return (self.ratio - 1.0) * mpg_witness + self.slack
 
     def met(self, point: TracePoint) -> bool:
-        """Whether the bounds are good enough."""
+        """Return whether the bounds are tight enough."""
         return point.mpg <= self.ratio * point.mpg_witness + self.slack

@@ -1,4 +1,4 @@
-"""The initial partition of a refinement: the cells that cover the set before any is split."""
+"""Chooses the initial partition of a refinement: the cells that cover the set before any is split."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from ns_abstract.refine.tuning import TUNING, Tuning
 
 
 class Partition(NamedTuple):
-    """Sub-boxes that cover the set, and the bounds of the one, or another, that was ``tried``."""
+    """Sub-boxes that cover the set, and the bounds of a sub-box that was ``tried``."""
 
     parts: list[SubBox]
     tried: SubBox
@@ -27,7 +27,7 @@ class Partition(NamedTuple):
 
 
 class InitialPartition:
-    """Chooses as many initial cells as the goal takes, and time and memory allow."""
+    """Chooses the number of initial cells by the goal, within the time and memory."""
 
     def __init__(
         self, tiles: FrameTiles, splitter: BoxSplitter, inner: InnerBound, goal: RefinementGoal, tuning: Tuning = TUNING
@@ -35,7 +35,7 @@ class InitialPartition:
         self.tiles, self.splitter, self.inner, self.goal, self.tuning = tiles, splitter, inner, goal, tuning
 
     def choose(self) -> Partition:
-        """The sub-boxes."""
+        """Return the partition."""
         frame, parts = self.tiles.frame, [self.splitter.whole]
         if frame.tilewise or not frame.box.dimensions:
             return Partition(parts, parts[0], self._probe(parts[0])[0])
@@ -58,7 +58,7 @@ class InitialPartition:
         return Partition(parts, first, probe)
 
     def _finer_parts(self, now: Partition, allowed: float) -> Partition:
-        """Parts halved again along what a cell in the middle varies most along, while its excess asks for it."""
+        """Return parts halved along the axis of most variation while the excess of a middle cell is too large."""
         tuning = self.tuning
         aim = tuning.aim_multiple * self.goal.excess(self.inner.mean_gap)
         best, least, idle = now, np.inf, 0
@@ -80,7 +80,7 @@ class InitialPartition:
             now = Partition(parts, first, probe)
 
     def _equal_parts(self) -> Partition:
-        """Parts of one parameter: as many as the excess of a cell in the middle asks for."""
+        """Return equal parts of one parameter, as many as the excess of a middle cell demands."""
         tuning, frame, whole = self.tuning, self.tiles.frame, self.splitter.whole
         motion = float(np.nan_to_num(frame.motion(frame.box)[0], nan=0.0))
         # odd: the middle of the set, which is rendered, is that of a part
@@ -114,7 +114,7 @@ class InitialPartition:
             count, before = 2 * count + 1, excess
 
     def _sampled_count(self, count: int, goal: RefinementGoal) -> int:
-        """Odd number of equal parts that some tiles ask for, where ``count`` seemed right; at most twice as many."""
+        """Return an odd number of equal parts by the excess in sampled tiles, at most twice ``count``."""
         tuning, inner = self.tuning, self.inner
         random, tiles = np.random.default_rng(0), self.tiles
         places = np.sort(random.choice(tiles.count, tiles.count // tuning.tiles_a_sample, replace=False))
@@ -126,18 +126,18 @@ class InitialPartition:
         return math.ceil(count * math.sqrt(min(excess / aim, 4.0))) | 1 if aim > 0.0 < excess else count
 
     def _helped(self, excess: float, before: float, share: float) -> bool:
-        """Whether smaller cells left at most ``share`` of the excess ``before``, or that may have been cut off."""
+        """Return whether smaller cells left at most ``share`` of the excess ``before``, or it may be clipped."""
         if excess <= share * before or before == math.inf:
             return True
         most = self.tiles.mean_gap(np.zeros_like(self.inner.image), np.ones_like(self.inner.image))
         return before >= self.tuning.clipped_share * most
 
     def _beyond(self, partition: Partition) -> float:
-        """MPG of what was tried beyond that of pictures of it."""
+        """Return the excess of the tried sub-box: its MPG beyond that of renders."""
         return self.inner.beyond(partition.tried, partition.bounds.lower, partition.bounds.upper)
 
     def _probe(self, part: SubBox) -> tuple[Bounds, float]:
-        """Bounds of ``part``, and how many such cells time and memory allow."""
+        """Return bounds of ``part``, and the number of such cells that time and memory allow."""
         started = time.perf_counter()
         tiles = self.tiles
         probe = tiles.frame.bound(part.box, tiles.numbers(None), None, tiles.keep_linear)

@@ -1,4 +1,4 @@
-"""The inner bound of a refinement: what pictures of the set really show."""
+"""The inner bound of a refinement: extremes of rendered pictures of the set."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ class InnerBound:
 
     Attributes:
         lower, upper: [t, side, side, channels] float32.
-        picture_seconds: Least that a picture took to render, the first apart, which may compile kernels; 0: not known.
+        picture_seconds: Shortest time of a render, without the first one, which may compile kernels; 0: unknown.
     """
 
     def __init__(
@@ -51,7 +51,7 @@ class InnerBound:
         self.tiles.frame.observe(self.tiles.numbers(None), self.lower, self.upper)
 
     def render(self, values: np.ndarray, places: np.ndarray | None = None) -> np.ndarray:
-        """Render the pose at ``values``, and some other scenes there; returns the picture of the frame's own scene."""
+        """Render the pose at ``values``, and some other scenes there; return the picture of the frame's own scene."""
         begin = time.perf_counter()
         picture = self.tiles.render(self.tiles.frame.render, values, places)
         if places is None:
@@ -67,21 +67,21 @@ class InnerBound:
         self.picture_seconds = 0.0
 
     def render_scenes(self, over: Callable[[], bool]) -> None:
-        """Render other scenes of the set at its middle, until ``over`` says so."""
+        """Render other scenes of the set at its middle, until ``over`` returns True."""
         for render in itertools.islice(self.scenes, self.tuning.scene_samples):
             self._widen(self.tiles.render(render, self.tiles.frame.box.middle, None), None)
             if over():
                 break
 
     def render_all(self, poses: Iterator[np.ndarray] | np.ndarray, over: Callable[[], bool]) -> None:
-        """Render poses [n, d], until ``over`` says so."""
+        """Render poses [n, d], until ``over`` returns True."""
         for values in poses:
             self.render(values)
             if over():
                 break
 
     def render_children(self, parent: LeafCell, children: Sequence[LeafCell], places: np.ndarray) -> None:
-        """Render poses in the parts of a cell that is split."""
+        """Render poses in the parts of a split cell."""
         if parent.box.dimensions > 1:
             if children:
                 # one of them: the first corners have shown most of what there is to see
@@ -95,20 +95,20 @@ class InnerBound:
             self.render(end if step == steps else child.box.at(np.array([2.0 * step / steps - 1.0])), places)
 
     def outlying(self, part: SubBox) -> np.ndarray:
-        """A point [d] of ``part`` as far out in the set as it reaches, where pixels are likely to be extreme.
+        """Return the point [d] of ``part`` farthest out in the set, where pixels are likely to be extreme.
 
-        Which end is taken by chance where the part spans the set.
+        Where the part spans the set along an axis, one end is chosen at random.
         """
         box = part.box
         last = part.last & (~part.first | (self.random.random(box.dimensions) < 0.5))
         return np.where(last, box.upper, np.where(part.first, box.lower, box.middle))
 
     def corners(self) -> np.ndarray:
-        """Corners of the set [n, d] that are to be rendered, some of them where there are many."""
+        """Return the corners of the set [n, d] to render, a sample where there are many."""
         return _some_corners(self.tiles.frame.box, self.random, self.tuning.most_corners)
 
     def beyond(self, part: SubBox, lower: np.ndarray, upper: np.ndarray, places: np.ndarray | None = None) -> float:
-        """MPG of bounds of ``part`` beyond that of the pictures at its two ends and at the middle of the set.
+        """Return the MPG of bounds of ``part`` beyond that of renders at its two ends and at the middle of the set.
 
         The bounds are those of the tiles at ``places``; None: all.
         """
@@ -119,14 +119,14 @@ class InnerBound:
         return self.tiles.mean_gap(*usable(lower, upper), places) - self.tiles.mean_gap(low, high, places)
 
     def look_around(self, stopped: Callable[[], bool]) -> None:
-        """Render poses across the set, for those who look at what linear sets say of them."""
+        """Render poses across the set, to be shown beside linear sets."""
         for values in self._across():
             if stopped():
                 return
             self._views.append((values, self.render(values)))
 
     def _across(self) -> Iterator[np.ndarray]:
-        """Poses [d] across the set: evenly along one parameter; along each of several, the others at their middles."""
+        """Yield poses [d] across the set: evenly along one parameter, or along each axis of several."""
         box = self.tiles.frame.box
         count = self.tuning.views if box.dimensions == 1 else self.tuning.axis_views + 1
         for axis in range(box.dimensions):
@@ -156,7 +156,7 @@ class InnerBound:
 
 
 def sampled_gap(frame: Frame, index: int, seed: int, tuning: Tuning = TUNING) -> float:
-    """MPG of the pictures at the middle and at two opposite ends of the set: no more than the inner bound's."""
+    """Return the MPG of renders at the middle and at two opposite ends of the set: at most the inner bound's."""
     corners = _some_corners(frame.box, np.random.default_rng([seed, index]), tuning.most_corners)
     pictures = [frame.render(values) for values in (frame.box.middle, *corners[[0, -1]])]
     least, most = np.minimum.reduce(pictures), np.maximum.reduce(pictures)
@@ -164,7 +164,7 @@ def sampled_gap(frame: Frame, index: int, seed: int, tuning: Tuning = TUNING) ->
 
 
 def _some_corners(box: ParameterBox, random: np.random.Generator, most_corners: int) -> np.ndarray:
-    """Corners of a set [n, d], at most ``most_corners`` of them by chance."""
+    """Return corners of a set [n, d], at most ``most_corners`` of them, drawn at random."""
     if not box.dimensions:
         return np.empty((0, 0))
     corners = box.corners()

@@ -1,4 +1,4 @@
-"""Bounds of the largest value of a `DifferenceFrame`, then of all its pixels (design.md, Y4)."""
+"""Bounds the largest value of a `DifferenceFrame`, then all of its pixels (docs/dev/design.md, Y4)."""
 
 from __future__ import annotations
 
@@ -22,22 +22,22 @@ from ns_abstract.refine.result import FrameResult, PartResult, TracePoint, great
 
 @dataclass(frozen=True)
 class LargestTuning:
-    """How the time of a frame is divided. None of the numbers decides whether a bound holds.
+    """How the time of a frame is divided; soundness does not depend on it.
 
     Attributes:
         poses: Random poses rendered in the search for the largest value.
-        corners: Most corners of the set rendered there.
+        corners: Largest number of corners of the set rendered there.
         starts: Best poses from which the search climbs.
-        first_step: Its first step, as a part of each parameter's range.
-        halvings: Times that the step is halved.
-        search_share: Part of the time that the search may take.
-        cover_share: Part of the time left that the first pass may take.
-        accepted_ratios: Ratios to the largest rendered value up to which values are left open, one pass each, before
-            the one that the goal asks for.
-        room: What a pass leaves open at least beyond the largest rendered value.
-        pass_share: Part of the time left that a pass may take, where others follow.
-        gain: Part of what a pass leaves open that it has to take away before it has had `patience` more cells.
-        patience: Multiple of the cells that the pass had when it last gained as much, and so many cells beside.
+        first_step: Its first step, as a fraction of each parameter's range.
+        halvings: How often the step is halved.
+        search_share: Fraction of the time that the search may take.
+        cover_share: Fraction of the remaining time that the first pass may take.
+        accepted_ratios: A pass leaves values open up to this multiple of the largest rendered value, one pass each,
+            before the multiple of the goal.
+        room: Least excess over the largest rendered value that a pass leaves open.
+        pass_share: Fraction of the remaining time that a pass may take if others follow.
+        gain: Fraction of a pass's excess that it has to remove within `patience` more cells.
+        patience: Multiple of the cells that the pass had when it last gained as much, and more cells in addition.
     """
 
     poses: int = 48
@@ -58,14 +58,14 @@ TUNING = LargestTuning()
 
 
 class GainWatch:
-    """Watches whether a pass still gains: what stays open in the narrowest cells takes ever more cells for nothing."""
+    """Watches whether a pass still gains: the excess of the narrowest cells takes ever more cells in vain."""
 
     def __init__(self, tuning: LargestTuning = TUNING) -> None:
         self.tuning, self.idle = tuning, False
         self._open, self._cells = float("inf"), 0
 
     def look(self, cells: int, left_open: float) -> None:
-        """Take the number of cells so far, and what they leave open on average."""
+        """Record the number of cells so far, and their mean excess."""
         multiple, more = self.tuning.patience
         if left_open < (1.0 - self.tuning.gain) * self._open:
             self._open, self._cells = left_open, cells
@@ -73,7 +73,7 @@ class GainWatch:
 
 
 def search_largest(frame: DifferenceFrame, seed: int, over: Callable[[], bool], tuning: LargestTuning = TUNING) -> None:
-    """Render poses where the difference may be largest; ``frame.largest`` is then the best one."""
+    """Render poses where the difference may be largest; the best one becomes ``frame.largest``."""
     box, random = frame.box, np.random.default_rng(seed)
 
     def look(values: np.ndarray) -> float:
@@ -110,17 +110,17 @@ def _neighbours(values: np.ndarray, step: np.ndarray, low: np.ndarray, high: np.
 
 
 class LargestDifference:
-    """Bounds a difference's largest value and every pixel of it (design.md, Y4).
+    """Bounds a difference's largest value and every pixel of it (docs/dev/design.md, Y4).
 
     A pass is a `Refinement` that leaves accepted values open: cells and pixels up to that value cost nothing. Passes
-    accept less and less; the last one nothing. What each of them finds holds, so that the least is taken.
+    accept less and less, the last one nothing. The results of all passes hold, so the least bound is taken.
 
     Args:
         whole: The difference over the set, in the set's own parameters; its renders are searched for the worst pose.
-        frame: The difference that is bounded: ``whole``, or one whose box counts parameters otherwise.
-        goal: When to stop: ``ratio`` is meant of the largest bound to the largest value rendered, then of the means.
-        tolerance: Value of which is asked whether all stay below it; the work ends once that is decided.
-        progress: Called with (trace point, covered part of the set); ``mpg`` and ``mpg_witness`` of its points are
+        frame: The difference that is bounded: ``whole``, or one whose box has other parameters.
+        goal: When to stop: ``ratio`` is of the largest bound to the largest value rendered, then of the means.
+        tolerance: The work ends once it is decided whether all values stay below it.
+        progress: Called with (trace point, covered fraction of the set); ``mpg`` and ``mpg_witness`` of its points are
             the largest bound and the largest value rendered.
     """
 
@@ -162,19 +162,19 @@ class LargestDifference:
         return self.goal.seconds - (time.perf_counter() - self.begin)
 
     def _most(self, pictures: np.ndarray) -> float:
-        """Largest value of the tiles that are bounded."""
+        """Return the largest value of the bounded tiles."""
         return float(pictures[self.tiles][self.inside[self.tiles]].max(initial=0.0))
 
     @property
     def _largest_rendered(self) -> float:
-        """Of the whole picture, so that parts of a frame have one goal."""
+        """Return the largest rendered value of the whole picture, so that groups of tiles have one goal."""
         return float(self.rendered[self.inside].max(initial=0.0))
 
     def run(self) -> PartResult:
-        """Search, then bound until the goal is reached; sound whenever it ends.
+        """Search, then bound until the goal is reached, and return the result; it is sound whenever it ends.
 
         Raises:
-            WorkCancelledError: ``stopped`` was true before a first picture was there.
+            WorkCancelledError: ``stopped`` was true before there was a first picture.
         """
         with cancel_when(self.stopped):
             # the first call compiles kernels, and the clock starts after it
@@ -199,7 +199,7 @@ class LargestDifference:
         return self._result(middle)
 
     def _passes(self) -> Iterator[tuple[float, float]]:
-        """The largest accepted value and the part of the time left of each pass, until the goal is reached."""
+        """Yield each pass's largest accepted value and fraction of the remaining time, until the goal is reached."""
         if self.tolerance is not None:
             if not self._decided:
                 yield self.tolerance, 1.0
@@ -213,14 +213,14 @@ class LargestDifference:
 
     @property
     def _decided(self) -> bool:
-        """Whether it is known that all values stay within the tolerance, or that one does not."""
+        """Return whether all values surely stay within the tolerance, or one surely does not."""
         assert self.tolerance is not None
         return self._most(self.upper) <= self.tolerance or self._largest_rendered > self.tolerance
 
     def _bound(
         self, accepted: float, time_share: float, enough: Callable[[Refinement], bool] = lambda refinement: False
     ) -> None:
-        """One pass over the tiles above the accepted value, in a part of the time left, or until ``enough``."""
+        """Do one pass over the tiles above the accepted value, in a fraction of the time left, or until ``enough``."""
         # what is rounded up would stay above the accepted value
         camera, (least,) = self.frame.camera, outward(np.array([accepted]), np.zeros(1))[0]
         # nothing above the accepted value is to be left open; where it is 0, means are measured

@@ -1,4 +1,4 @@
-"""The leaves of a refinement: bounds of every (cell, tile) pair, and the outer bound that they make up."""
+"""The leaves of a refinement: bounds of every (cell, tile) pair, and the outer bound that they form."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ BoundedCell = tuple[LeafCell, np.ndarray, np.ndarray]
 
 @dataclass
 class Change:
-    """What a round does to the leaves of one tile: rows that go, and what comes in their place."""
+    """A round's change of the leaves of one tile: removed rows, and the new leaves."""
 
     gone: list[int] = field(default_factory=list)
     cells: list[LeafCell] = field(default_factory=list)
@@ -30,7 +30,7 @@ class Change:
 
 @dataclass
 class TileLeaves:
-    """The leaves of one tile: [n, side, side, channels] bounds, and everything that is no longer split."""
+    """The leaves of one tile: bounds [n, side, side, channels], and the union of leaves that are no longer split."""
 
     closed_lower: np.ndarray
     closed_upper: np.ndarray
@@ -39,7 +39,7 @@ class TileLeaves:
     upper: np.ndarray | None = None
 
     def replace(self, change: Change) -> None:
-        """Take out the leaves in the rows ``change.gone`` and append the new ones."""
+        """Remove the leaves in the rows ``change.gone`` and append the new ones."""
         keep = np.ones(len(self.cells), bool)
         keep[change.gone] = False
         old_lower = [] if self.lower is None else [self.lower[keep]]
@@ -52,7 +52,7 @@ class TileLeaves:
         self.upper = np.concatenate([*old_upper, *(a[None] for a in change.upper)])
 
     def close(self, which: np.ndarray) -> None:
-        """Leaves ``which`` [n] (bool) keep their bounds and are not split any more."""
+        """Close the leaves ``which`` [n] (bool): they keep their bounds and are not split any more."""
         if self.lower is None or self.upper is None or not which.any():
             return
         self.closed_lower = np.minimum(self.closed_lower, self.lower[which].min(axis=0))
@@ -62,7 +62,7 @@ class TileLeaves:
         self.lower, self.upper = (self.lower[stay], self.upper[stay]) if self.cells else (None, None)
 
     def outer(self, change: Change | None = None) -> tuple[np.ndarray, np.ndarray]:
-        """[side, side, channels] bounds over all leaves, as they will be after ``change``."""
+        """Return bounds [side, side, channels] over all leaves, as they will be after ``change``."""
         lower, upper = [self.closed_lower[None]], [self.closed_upper[None]]
         if self.lower is not None and self.upper is not None:
             keep = np.ones(len(self.cells), bool)
@@ -77,13 +77,13 @@ class TileLeaves:
 
 
 class LeafBounds:
-    """The leaves of all tiles, and which of them are split next.
+    """The leaves of all tiles, and the choice of those to split next.
 
     Args:
-        earlier: [t, side, side, 3] bounds of the same set that hold anyway; None: there are none.
+        earlier: [t, side, side, 3] earlier bounds of the same set; None: there are none.
 
     Attributes:
-        bytes: Memory that open leaves hold, as `next_round` has counted it.
+        bytes: Memory of open leaves, as `next_round` has counted it.
     """
 
     def __init__(
@@ -121,11 +121,11 @@ class LeafBounds:
         self._taken.clear()
 
     def take(self, cell: LeafCell, lower: np.ndarray, upper: np.ndarray) -> None:
-        """Keep the bounds of a cell in all tiles; `cover` follows when all cells are there."""
+        """Store the bounds of a cell in all tiles; call `cover` when all cells are stored."""
         self._taken.append((cell, lower, upper))
 
     def cover(self) -> None:
-        """Make the outer bound that of the cells that were taken."""
+        """Set the outer bound to that of the stored cells."""
         _, lower, upper = self._taken[0]
         self.lower[:], self.upper[:] = lower, upper
         for _, lower, upper in self._taken[1:]:
@@ -134,19 +134,19 @@ class LeafBounds:
         self._bound(self.tiles.all)
 
     def update(self, places: np.ndarray, changes: dict[int, Change] | None = None) -> None:
-        """Update the outer bound of the tiles at ``places``, given what has changed since the round began."""
+        """Update the outer bound of the tiles at ``places``, given the changes since the round began."""
         for t in places:
             self.lower[t], self.upper[t] = self.by_tile[t].outer(None if changes is None else changes[t])
         self._bound(places)
 
     def _bound(self, places: np.ndarray) -> None:
-        """Make the outer bound of tiles usable, with what was known before."""
+        """Make the outer bound of tiles usable, and intersect it with the earlier one."""
         self._intersect(places)
         self.lower[places], self.upper[places] = usable(self.lower[places], self.upper[places])
         self._mean_gap = None
 
     def _divide(self) -> None:
-        """Hand the cells that were taken to the tiles, each its part of their bounds."""
+        """Move the stored cells' bounds to the leaves of each tile."""
         cells = [cell for cell, _, _ in self._taken]
         for tile in self.by_tile:
             tile.cells = list(cells)
@@ -161,37 +161,37 @@ class LeafBounds:
                 tile.lower[row], tile.upper[row] = low, high
 
     def apply(self, changes: dict[int, Change]) -> None:
-        """End a round with what has changed in it."""
+        """End a round with its changes."""
         for t, change in changes.items():
             self.by_tile[t].replace(change)
         self.update(np.array(sorted(changes), np.int64))
 
     def _intersect(self, places: np.ndarray) -> None:
-        """Take what was known before into the outer bound of tiles: both hold (design.md, R5)."""
+        """Intersect the outer bound of tiles with the earlier one: both hold (docs/dev/design.md, R5)."""
         if self.earlier is not None:
             lower, upper = self.earlier
             low, high = self.lower[..., :COLORS], self.upper[..., :COLORS]
             low[places], high[places] = np.maximum(low[places], lower[places]), np.minimum(high[places], upper[places])
 
     def row(self, t: int, row: int) -> tuple[np.ndarray, np.ndarray]:
-        """[side, side, channels] bounds of one leaf of tile t."""
+        """Return bounds [side, side, channels] of one leaf of tile t."""
         tile = self.by_tile[t]
         assert tile.lower is not None and tile.upper is not None
         return tile.lower[row], tile.upper[row]
 
     def wanted(self, rows: dict[int, int]) -> np.ndarray | None:
-        """[t, side, side] the pixels that leaves in the tiles and rows ``rows`` are split for; None: all."""
+        """Return [t, side, side] the pixels for which leaves in the tiles and rows ``rows`` are split; None: all."""
         if not self.tiles.by_pixel:
             return None
         return np.stack([self._open(t, *(side[None] for side in self.row(t, row)))[0] > 0.0 for t, row in rows.items()])
 
     def close_excess(self, allowed: float) -> None:
-        """Leave pixels of leaves for good that could take little more away from the excess that is ``allowed``."""
+        """Close pixels of leaves that could reduce the excess by little, compared with the ``allowed`` one."""
         if self.tiles.by_pixel:
             self._closed_excess = max(self._closed_excess, self.tuning.closed_share * allowed)
 
     def next_round(self, goal: RefinementGoal) -> tuple[list[tuple[LeafCell, dict[int, int]]], int]:
-        """The cells to split in the next round, each with its row by tile, and into how many parts."""
+        """Return the cells to split in the next round, each with its row by tile, and the number of parts."""
         if self._taken:
             self._divide()
         while True:
@@ -220,7 +220,7 @@ class LeafBounds:
         return jobs, MOST_PARTS if running[-1] > self.tuning.wide_split_excess * allowed else 2
 
     def _excess(self) -> tuple[np.ndarray, list[tuple[int, int]]]:
-        """What every open leaf leaves open beyond the inner bound, and its tile and row.
+        """Return every open leaf's excess over the inner bound, and its tile and row.
 
         Leaves that cannot be improved are closed; the memory of the others is counted.
         """
@@ -245,7 +245,7 @@ class LeafBounds:
         return np.concatenate(excess), owner
 
     def _open(self, t: int, lower: np.ndarray, upper: np.ndarray) -> np.ndarray:
-        """[n, side, side] what leaves of tile t leave open beyond the inner bound, where that is not too little."""
+        """Return the excess [n, side, side] of leaves of tile t over the inner bound, zero where it is too small."""
         colors = np.s_[..., :COLORS]
         lower, upper = lower[colors], upper[colors]
         if self.earlier is not None:
@@ -256,7 +256,7 @@ class LeafBounds:
         return np.where(self.tiles.inside[t] & (beyond > self._closed_excess), beyond, 0.0)
 
     def _close_least(self, order: np.ndarray, owner: list[tuple[int, int]]) -> None:
-        """Free memory: the half of the leaves that have least excess are not split any more."""
+        """Free memory: close the half of the leaves with the least excess."""
         closing: dict[int, list[int]] = {}
         for position in order[order.size // 2 :]:
             t, k = owner[position]
@@ -271,21 +271,21 @@ class LeafBounds:
 
 
 class LeafSets:
-    """The linear sets of every (cell, tile) leaf of ``tiles``; nothing is kept unless its bounds carry them."""
+    """The linear sets of every (cell, tile) leaf of ``tiles``; empty unless the bounds have linear sets."""
 
     def __init__(self, tiles: FrameTiles) -> None:
         self.tiles, self.bytes = tiles, 0
         self._sets: dict[tuple[int, int], tuple[ParameterBox, tuple[np.ndarray, ...]]] = {}
 
     def clear(self) -> None:
-        """Give up all of them."""
+        """Drop all sets."""
         self._sets.clear()
         self.bytes = 0
 
     def keep(
         self, cell: LeafCell, linear: LinearSets | None, places: np.ndarray, parent: LeafCell | None = None
     ) -> None:
-        """Store the ``linear`` sets of ``cell`` in the tiles at ``places``, in place of those of its ``parent``."""
+        """Store the ``linear`` sets of ``cell`` in the tiles at ``places``, replacing those of its ``parent``."""
         if not self.tiles.keep_linear or linear is None:
             return
         linear = _usable_linear(linear)
@@ -299,13 +299,13 @@ class LeafSets:
             self.bytes += sum(a.nbytes for a in entry)
 
     def keep_unknown(self, cell: LeafCell, others: LinearSets | None, places: np.ndarray) -> None:
-        """Store sets that say nothing but [0, 1] in the tiles at ``places``, where ``others`` have sets."""
+        """Store the sets [0, 1] in the tiles at ``places``, where ``others`` have sets."""
         if others is not None:
             a, b, c, d = (np.full((len(places), *part.shape[1:]), np.nan, part.dtype) for part in others)
             self.keep(cell, (a, b, c, d), places)
 
     def leaves(self) -> Leaves:
-        """The linear bounds of all leaves, ordered by box and tile."""
+        """Return the linear bounds of all leaves, ordered by box and tile."""
         frame = self.tiles.frame
         d, side = frame.box.dimensions, frame.side
         entries = sorted(
@@ -332,12 +332,12 @@ class LeafSets:
 
 
 def linear_bytes(bounds: Bounds) -> int:
-    """Memory of a cell's linear sets."""
+    """Return the bytes of a cell's linear sets."""
     return 0 if bounds.linear is None else sum(a.nbytes for a in bounds.linear)
 
 
 def _usable_linear(linear: LinearSets) -> LinearSets:
-    """Linear sets (A_lower, b_lower, A_upper, b_upper) with 0 and 1 where a number is not finite."""
+    """Return linear sets (A_lower, b_lower, A_upper, b_upper) with [0, 1] where a number is not finite."""
     parts: list[np.ndarray] = []
     for slope, offset, trivial in ((linear[0], linear[1], 0.0), (linear[2], linear[3], 1.0)):
         good = np.isfinite(slope).all(axis=-1) & np.isfinite(offset)

@@ -32,10 +32,10 @@ class LinearImage(ArrayRecord):
     b_upper: Float32Array
 
     def to_torch(self) -> Any:
-        """A torch module whose images contain every picture of the box.
+        """Return a torch module whose images contain every picture of the box.
 
         ``module(p, e)`` takes parameters [n, d] and slacks [n, 3, H, W] in [-1, 1], and returns ``A p + b + radius *
-        e`` [n, 3, H, W]: for every ``p``, the picture there is the image of some ``e`` (R7). What holds is real
+        e`` [n, 3, H, W]: for every ``p``, the picture there is the image of some ``e`` (R7). This holds in real
         arithmetic; a float32 evaluation of the module errs as that of any layer.
         """
         from ns_abstract.refine.torch_image import LinearRenderer
@@ -43,7 +43,7 @@ class LinearImage(ArrayRecord):
         return LinearRenderer(*self.middle())
 
     def middle(self) -> tuple[Float32Array, Float32Array, Float32Array]:
-        """A [H, W, 3, d], b and radius [H, W, 3] float32 with ``|picture - (A p + b)| <= radius`` on the box (R7)."""
+        """Return A [H, W, 3, d], b, radius [H, W, 3] float32 with ``|picture - (A p + b)| <= radius`` (R7)."""
         lower, upper = self.A_lower.astype(np.float64), self.A_upper.astype(np.float64)
         slope = (0.5 * (lower + upper)).astype(np.float32)
         low = self.b_lower - np.abs(lower - slope).sum(axis=-1)
@@ -56,10 +56,10 @@ class LinearImage(ArrayRecord):
 
 @dataclass(frozen=True)
 class _Part:
-    """Where one leaf meets a box, along each axis; all numbers [d], at most 1 in size.
+    """The intersection of one leaf with a box, along each axis; all numbers [d], at most 1 in size.
 
     Attributes:
-        scale, shift: Of the leaf's own parameters: on the common part they are ``shift + scale * t``, t in [-1, 1]^d.
+        scale, shift: On the intersection, the leaf's own parameters are ``shift + scale * t``, t in [-1, 1]^d.
     """
 
     scale: Float64Array
@@ -69,14 +69,14 @@ class _Part:
 
 
 def _place(low: Float64Array, high: Float64Array, start: Float64Array, end: Float64Array) -> tuple[Float64Array, ...]:
-    """Scale and shift of [start, end] within [low, high] as [-1, 1]: six roundings of numbers up to 1 (R7)."""
+    """Return scale and shift of [start, end] within [low, high] as [-1, 1]: six roundings of numbers up to 1 (R7)."""
     width = end - start
     divisor = np.where(width > 0.0, width, 1.0)
     return (high - low) / divisor, ((low - start) + (high - end)) / divisor
 
 
 def _parts(leaves: Leaves, rows: np.ndarray, box: ParameterBox) -> tuple[np.ndarray, _Part]:
-    """Those of ``rows`` that meet the box, and where: arrays [n, d]."""
+    """Return those of ``rows`` that meet the box, and the intersections: arrays [n, d]."""
     start, end = leaves.box_lower[rows], leaves.box_upper[rows]
     box_start, box_end = np.array(box.lower, np.float64), np.array(box.upper, np.float64)
     low, high = np.maximum(start, box_start), np.minimum(end, box_end)
@@ -88,7 +88,7 @@ def _parts(leaves: Leaves, rows: np.ndarray, box: ParameterBox) -> tuple[np.ndar
 
 
 def _complete(part: _Part, box: ParameterBox) -> bool:
-    """Whether leaves cover the box."""
+    """Return whether the leaves cover the box."""
     varied = np.array(box.lower) < np.array(box.upper)
     return bool(part.box_scale[:, varied].prod(axis=1).sum() >= COVER_DOWN)
 
@@ -98,7 +98,7 @@ def _chunks(count: int) -> Iterator[slice]:
 
 
 def _slope(A: np.ndarray, b: np.ndarray, rows: np.ndarray, part: _Part, varied: np.ndarray) -> np.ndarray:
-    """Slopes of the least-squares plane through leaves' planes, [side, side, 3, d]; any slopes would be sound."""
+    """Return slopes [side, side, 3, d] of the least-squares plane through leaves' planes; any slopes are sound."""
     total = np.zeros(A.shape[1:], np.float64)
     shares = part.box_scale[:, varied].prod(axis=1)
     for some in _chunks(len(rows)):
@@ -111,7 +111,7 @@ def _slope(A: np.ndarray, b: np.ndarray, rows: np.ndarray, part: _Part, varied: 
 
 
 def _least(A: np.ndarray, b: np.ndarray, rows: np.ndarray, part: _Part, slope: np.ndarray, sign: float) -> np.ndarray:
-    """Offsets [side, side, 3] with which ``slope`` stays below every leaf's plane, times ``sign`` (R7)."""
+    """Return offsets [side, side, 3] with which ``slope`` stays below every leaf's plane, times ``sign`` (R7)."""
     least = np.full(b.shape[1:], np.inf)
     plane = sign * slope.astype(np.float64)
     for some in _chunks(len(rows)):
@@ -127,7 +127,7 @@ def _least(A: np.ndarray, b: np.ndarray, rows: np.ndarray, part: _Part, slope: n
 
 
 def _by_tile(leaves: Leaves) -> Iterator[tuple[int, int, np.ndarray]]:
-    """First row and column of every tile, and its leaves."""
+    """Yield first row and column of every tile, and its leaves."""
     tiles, group = np.unique(leaves.tile, axis=0, return_inverse=True)
     order = np.argsort(group.reshape(-1), kind="stable")
     ends = np.cumsum(np.bincount(group.reshape(-1), minlength=len(tiles)))
@@ -136,9 +136,9 @@ def _by_tile(leaves: Leaves) -> Iterator[tuple[int, int, np.ndarray]]:
 
 
 def linear_image(leaves: Leaves, lower: Float32Array, upper: Float32Array, box: ParameterBox) -> LinearImage:
-    """One linear map for a whole picture over a ``box``, a part of the set (R7).
+    """Return one linear map of the whole picture over ``box``, a part of the set (R7).
 
-    ``lower``, ``upper`` [H, W, 3] hold on the whole set; they are taken where no plane is better on average, and where
+    ``lower``, ``upper`` [H, W, 3] hold on the whole set; they are used where no plane is tighter on average, and where
     leaves do not cover the box.
     """
     varied = np.array(box.lower) < np.array(box.upper)
@@ -168,7 +168,7 @@ def linear_image(leaves: Leaves, lower: Float32Array, upper: Float32Array, box: 
 def bounds_at(
     leaves: Leaves | None, lower: Float32Array, upper: Float32Array, point: Float64Array
 ) -> tuple[Float32Array, Float32Array]:
-    """Bounds [H, W, 3] float32 of the picture at a point of the set, from the leaves that hold it (R7)."""
+    """Return bounds [H, W, 3] float32 of the picture at a point of the set, from the leaves that contain it (R7)."""
     low, high = lower.copy(), upper.copy()
     if leaves is None:
         return low, high

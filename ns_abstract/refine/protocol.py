@@ -51,20 +51,20 @@ class SceneElements(NamedTuple):
 
 
 class SceneSample(Protocol):
-    """A sample of a set of scenes."""
+    """One scene of a set of scenes; calling it renders the scene."""
 
     def __call__(self, values: np.ndarray, tiles: np.ndarray | None = None) -> np.ndarray:
-        """Tiles [t, side, side, 3] float32 of the concrete image at parameter values [d]; all tiles if None."""
+        """Return tiles [t, side, side, 3] float32 of the image at parameter values [d]; all tiles if None."""
         ...
 
     def signed_gradient_step(
         self, box: ParameterBox, values: np.ndarray, score: Score, size: float
     ) -> tuple[np.ndarray, SceneSample]:
-        """Parameter values in ``box`` and a scene a signed step on, along which the score of the picture should grow.
+        """Return parameter values in ``box`` and a scene one signed gradient step on, to raise the picture's score.
 
         Args:
             values: [d] where the step begins.
-            score: What should grow.
+            score: What is to be raised.
             size: Length in half-widths of every range.
         """
         ...
@@ -76,7 +76,7 @@ class SceneSample(Protocol):
 
     @property
     def arrays(self) -> dict[str, np.ndarray]:
-        """The numbers in which the scene differs from others of its set, by name."""
+        """Return by name the numbers in which the scene differs from others of its set."""
         ...
 
 
@@ -85,12 +85,12 @@ class CellContext(Protocol):
 
     @property
     def nbytes(self) -> int:
-        """Memory that it holds."""
+        """The bytes that it holds."""
         ...
 
     @property
     def shown(self) -> np.ndarray | None:
-        """Numbers [n] of the scene elements that the cell may show; None where elements are not told apart."""
+        """Numbers [n] of the scene elements that the cell may show; None where elements have no numbers."""
         ...
 
 
@@ -100,9 +100,9 @@ class Bounds:
 
     Attributes:
         lower, upper: [t, side, side, channels] float32, rounded outward; see `Frame`.
-        slopes: [d] how much the picture varies by parameter: what a cut along it may gain.
-        context: For the cells inside this one; None: nothing is known that would help.
-        linear: Linear bounds in the cell's parameters, if they were asked for.
+        slopes: [d] variation of the picture by parameter: the gain of a cut along it.
+        context: For the cells inside this one; None: there is nothing to reuse.
+        linear: Linear bounds in the cell's parameters, if they were requested.
         forms: [t, side, side, 3, m + 1] with linear bounds: coefficients of polynomials in the cell's parameters and a
             radius, before the clamp to [0, 1]; None: there are none.
     """
@@ -151,68 +151,68 @@ class Frame(Protocol):
         return self.across * self.down
 
     def warm_up(self, stage: str | None = None) -> None:
-        """Compile what is compiled at first use, all of it or one of `stages`."""
+        """Compile the kernels that are compiled at first use: all of them, or one of `stages`."""
         ...
 
     def render(self, values: np.ndarray, tiles: np.ndarray | None = None) -> np.ndarray:
-        """Tiles [t, side, side, channels] float32 of the concrete image at parameter values [d]; all tiles if None."""
+        """Return tiles [t, side, side, channels] float32 of the image at parameter values [d]; all tiles if None."""
         ...
 
     def scene_samples(self, seed: int) -> Iterator[SceneSample]:
-        """Other scenes of the set; none where only poses vary."""
+        """Yield other scenes of the set; none where only poses vary."""
         return iter(())
 
     def bound(self, box: ParameterBox, tiles: np.ndarray, within: Any = None, keep_linear: bool = False) -> Bounds:
-        """Bounds of ``tiles`` over ``box``; ``within`` is the context of these tiles and a box around it."""
+        """Return bounds of ``tiles`` over ``box``; ``within`` is the context of these tiles and an enclosing box."""
         return self.bound_parts([box], tiles, within, keep_linear, None)[0]
 
     def bound_parts(
         self, boxes: Sequence[ParameterBox], tiles: np.ndarray, within: Any, keep_linear: bool,
         pixels: np.ndarray | None,
     ) -> Sequence[Bounds]:  # fmt: skip
-        """What `bound` returns of each of ``boxes``, at most `MOST_PARTS`, side by side.
+        """Return the result of `bound` for each of ``boxes``, at most `MOST_PARTS`, computed side by side.
 
-        ``within``: the context from a box around all cells. ``pixels`` [t, side, side]: which are wanted, others may be
-        left at [0, 1]; all if None.
+        ``within``: the context of a box around all cells. ``pixels`` [t, side, side]: the needed ones, others may stay
+        at [0, 1]; None: all.
         """
         ...
 
     def feasible(self, box: ParameterBox) -> ParameterBox | None:
-        """A part of ``box`` that holds all parameters in it of poses of the set; None where there are none."""
+        """Return a part of ``box`` that contains all parameters in it of poses of the set; None: there are none."""
         ...
 
     def motion(self, box: ParameterBox) -> np.ndarray:
-        """[d] pixels that the picture moves by over each parameter's range (an estimate)."""
+        """Return the estimated image motion [d] in pixels over each parameter's range."""
         ...
 
     def depths(self) -> np.ndarray | None:
-        """[n] distances along the optical axis of some scene elements that the middle pose shows (normalised units).
+        """Return distances [n] along the optical axis of some visible scene elements at the middle pose (normalised).
 
-        None: elements have no place of their own.
+        None: elements have no position.
         """
         return None
 
     def observe(self, tiles: np.ndarray, lower: np.ndarray, upper: np.ndarray) -> None:
-        """Take the inner bounds [t, side, side, 3] of ``tiles`` [t] so far; a refinement calls it at every change."""
+        """Receive the inner bounds [t, side, side, 3] of ``tiles`` [t]; a refinement calls it at every change."""
 
     def set_tolerance(self, excess: float) -> float:
-        """Let later bounds be looser by a small part of ``excess`` on average; returns what light is left out, or 0."""
+        """Let later bounds be looser by a small fraction of ``excess`` on average; return the light left out, or 0."""
         return 0.0
 
     def plan(self, visible: int | None, lower: np.ndarray, upper: np.ndarray) -> list[str]:
-        """What was left out for this frame and why, one sentence each.
+        """Return a sentence on each thing that was left out for this frame, and why.
 
-        ``visible``: scene elements that some cell shows, if they are told apart; bounds [H, W, 3] are what refinement
-        found.
+        ``visible``: number of scene elements that some cell shows, if they have numbers; bounds [H, W, 3] are those of
+        refinement.
         """
         return []
 
 
 @runtime_checkable
 class CountedFrame(Protocol):
-    """An optional interface of a `Frame` without stages: what compiling its kernels takes.
+    """An optional interface of a `Frame` without stages: the cost of compiling its kernels.
 
-    ``compiled``: functions of the kernels, about, and the seconds that one core compiles.
+    ``compiled``: approximate number of functions of the kernels, and the seconds of one core.
     """
 
     compiled: tuple[int, float]
@@ -228,51 +228,51 @@ class SubBoxFrame(Protocol):
     """An optional interface of a `Frame`: bounds over each of many equal parts of a wide cell."""
 
     def motion_field(self, box: ParameterBox) -> MotionField:
-        """By how much the squares of a picture move over a cell of poses (an estimate)."""
+        """Return the estimated motion of the picture's blocks over a cell of poses."""
         ...
 
     def parallax(self, box: ParameterBox) -> np.ndarray:
-        """[d] pixels that typical elements move by, over each parameter's range, beside what their block does."""
+        """Return pixels [d] by which typical elements move over each parameter's range relative to their block."""
         ...
 
     def enclosing(self, box: ParameterBox) -> Any:
-        """What a wider cell around ``box`` shows, as `Frame.bound` takes it; None: nothing is known."""
+        """Return the context of a wider cell around ``box``, for `Frame.bound`; None: there is none."""
         ...
 
     def element_counts(self, box: ParameterBox) -> np.ndarray:
-        """[H, W] scene elements that bounds of each pixel over a cell look at (an estimate)."""
+        """Return the estimated number [H, W] of scene elements that bounds of each pixel over a cell look at."""
         ...
 
     def sub_box_ends(
         self, box: ParameterBox, counts: np.ndarray | MotionCells, tiles: np.ndarray, pixels: np.ndarray,
         goals: np.ndarray, differences: np.ndarray,
     ) -> tuple[np.ndarray, np.ndarray] | None:  # fmt: skip
-        """Lower and upper bounds [n, 3, k] of ``n`` pixels over ``k`` sub-boxes; None: there are none for this set.
+        """Return lower and upper bounds [n, 3, k] of ``n`` pixels over ``k`` sub-boxes; None: none for this set.
 
-        ``differences`` [n]: of which pixels `CHANNEL_DIFFERENCES` are bounded, not clamped to [0, 1], not channels.
-
-        There are ``counts`` [d] sub-boxes along the axes, powers of two, at least 8 together, numbered like entries of
-        an array of this shape; or cells of the image motion. Each is widened by `SUB_BOX_OVERLAP` of the half-widths.
-        ``pixels`` [t, side, side]: the ``n``. ``goals`` [n, 6]: values of the lower, then the upper bounds of channels
-        that only have to be known to lie on one side of them; infinite: all of a bound matters; NaN: it is not wanted.
+        There are ``counts`` [d] sub-boxes along the axes, powers of two, at least 8 together, in the order of an array
+        of this shape; or cells of the image motion. Each is widened by `SUB_BOX_OVERLAP` of the half-widths. ``pixels``
+        [t, side, side]: the ``n`` pixels. ``differences`` [n]: the pixels whose `CHANNEL_DIFFERENCES`, not clamped to
+        [0, 1], are bounded in place of channels. ``goals`` [n, 6], of the lower, then the upper bounds of channels:
+        values on one side of which a bound only has to be known to lie; infinite: the bound itself is needed; NaN: it
+        is not needed.
         """
         ...
 
     def warm_up_sub_boxes(self) -> None:
-        """Compile what `sub_box_ends` needs at first use besides the frame's own kernels."""
+        """Compile the kernels that `sub_box_ends` needs in addition to the frame's own."""
         ...
 
 
 class SharedOrder(Protocol):
-    """Two scenes some of whose elements lie at the same places, and so are drawn in the same order in both."""
+    """Two scenes with elements at the same places, which are drawn in the same order in both."""
 
     def bounds(
         self, box: ParameterBox, tile: int, pixels: np.ndarray, contexts: tuple[Any, Any]
     ) -> Sequence[tuple[Bounds, Bounds]] | None:
-        """Bounds of both scenes with linear bounds, once for every order of elements that a pose of ``box`` may have.
+        """Return linear bounds of both scenes, once for every depth order that a pose of ``box`` may have.
 
-        ``pixels`` [side, side] are wanted; ``contexts`` are of this tile and cell, or one around it. None: there are
-        too many orders, or one alone.
+        ``pixels`` [side, side] are needed; ``contexts`` are of this tile and this or an enclosing cell. None: there are
+        too many orders, or only one.
         """
         ...
 
@@ -282,37 +282,38 @@ class OrderedFrame(Protocol):
     """An optional interface of a `Frame`: the order of elements may be shared with another scene's."""
 
     def shared_order(self, other: Frame) -> SharedOrder | None:
-        """What both scenes' elements have in common; None: nothing. ``other`` has the same poses."""
+        """Return the elements that both scenes share; None: there are none. ``other`` has the same poses."""
         ...
 
 
 @runtime_checkable
 class PreciseFrame(Protocol):
-    """What a `Frame` may have beside: pictures that are not rounded."""
+    """An optional interface of a `Frame`: pictures that are not rounded."""
 
     def precise(self, values: np.ndarray, tiles: np.ndarray | None = None) -> np.ndarray:
-        """What `Frame.render` returns, before it is rounded: float64."""
+        """Return the result of `Frame.render` before it is rounded: float64."""
         ...
 
 
 class RayFrame(Frame, Protocol):
-    """A frame whose pictures are made ray by ray (`ns_abstract.methods.representation.Representation.rays`)."""
+    """A frame whose pictures are rendered ray by ray (`ns_abstract.methods.representation.Representation.rays`)."""
 
     def cell_bounds(
         self, box: ParameterBox, weigh: Callable[[], np.ndarray | None] | None = None, most_rays: int | None = None
     ) -> Bounds:
-        """Bounds of all tiles over a cell with linear bounds, for certificates, whatever was bounded before.
+        """Return linear bounds of all tiles over a cell, for certificates, whatever was bounded before.
 
-        ``weigh``: [H, W, 3] what part of a margin a unit of each pixel's width may cost, or None; asked at most once.
-        ``most_rays``: rays that are bounded, about, those that matter most first; others are left at [0, 1].
+        ``weigh``: returns [H, W, 3] the fraction of a margin that a unit of each pixel's width costs, or None; called
+        at most once. ``most_rays``: approximate number of bounded rays, those that matter most first; others stay at
+        [0, 1].
 
         Raises:
-            WorkCancelledError: There is no time for it.
+            WorkCancelledError: The deadline is over.
         """
         ...
 
     def effort(self) -> tuple[float | None, int]:
-        """Seconds that one ray takes over one part of the set, about, and in how many parts the set is bounded.
+        """Return the estimated seconds of one ray over one part of the set, and the number of parts.
 
         None: there was no time to find out.
         """
@@ -321,9 +322,9 @@ class RayFrame(Frame, Protocol):
 
 @dataclass(frozen=True)
 class WeightPlane:
-    """Which scene elements a plane adds up the blending weights of: those that meet both rules, None: any.
+    """The selection of scene elements whose blending weights a plane adds up; None in a rule: any element.
 
-    ``nearer``: distance to the camera (normalised units), along the optical axis for what has a place of its own, along
+    ``nearer``: distance to the camera (normalised units), along the optical axis for elements with a position, along
     the ray for samples of a field.
     """
 
@@ -336,23 +337,23 @@ MOST_PLANES = COLORS
 
 
 class WeightFrame(Frame, Protocol):
-    """A frame whose three channels are blending weights of chosen scene elements, and nothing behind them."""
+    """A frame whose three channels are blending weights of selected scene elements, with an empty background."""
 
     def of_sample(self, values: np.ndarray, sample: SceneSample | None) -> np.ndarray:
-        """What `Frame.render` returns, of a scene sample of the coloured frame of the same set; None: of the scene."""
+        """Return the result of `Frame.render` for a scene sample of the coloured frame; None: for the stored scene."""
         ...
 
     def differentiable(self, values: torch.Tensor) -> torch.Tensor:
-        """Weights [H, W, 3] at parameter values [d], differentiable where elements are chosen."""
+        """Return weights [H, W, 3] at parameter values [d], differentiable where elements are selected."""
         ...
 
 
 @runtime_checkable
 class ElementFrame(WeightFrame, Protocol):
-    """An optional interface of a `WeightFrame`: pictures of few pixels, drawn by the elements that show there alone."""
+    """An optional interface of a `WeightFrame`: renders few pixels from the elements that show there alone."""
 
     def drawn_alone(self, context: Any, tiles: np.ndarray, pixels: np.ndarray) -> Callable[[np.ndarray], np.ndarray]:
-        """What draws the ``tiles`` [t, side, side, 3] at parameter values [d] of a box; right at ``pixels`` alone.
+        """Return a function that renders ``tiles`` at parameter values [d] of a box; only ``pixels`` are right.
 
         ``context``: of these pixels and the box.
         """
@@ -362,10 +363,10 @@ class ElementFrame(WeightFrame, Protocol):
         self, box: ParameterBox, tiles: np.ndarray, within: Any, pixels: np.ndarray, counts: np.ndarray,
         levels: Sequence[float],
     ) -> tuple[Bounds, tuple[np.ndarray, np.ndarray]]:  # fmt: skip
-        """Bounds with linear bounds as `Frame.bound_parts` has them, and those over sub-boxes.
+        """Return `Frame.bound_parts` of one box with linear bounds, and bounds over sub-boxes.
 
-        The latter are a pair as of `SubBoxFrame.sub_box_ends`. Only where one of ``levels`` lies between the ends of a
-        pixel over a sub-box are these made as narrow as they can be; none: everywhere.
+        The latter are as in `SubBoxFrame.sub_box_ends`. They are as tight as possible only where one of ``levels`` lies
+        between a pixel's ends over a sub-box; without levels everywhere.
         """
         ...
 
@@ -375,16 +376,16 @@ class WeightMethod(Protocol):
     """An optional interface of a `Method`: frames of blending weights."""
 
     def weight_frame(self, poses: PoseBox, planes: Sequence[WeightPlane], pixels: np.ndarray) -> WeightFrame:
-        """The frame whose first channels are ``planes``, at most `MOST_PLANES`; ``pixels`` [H, W] will be read.
+        """Return the frame whose first channels are ``planes``, at most `MOST_PLANES`; ``pixels`` [H, W] are read.
 
         Raises:
-            InputError: A selection picks nothing, or this program's weights are not bounded.
+            InputError: A selection is empty, or this renderer's weights are not bounded.
         """
         ...
 
 
 class Method(Protocol):
-    """A scene and the program whose pictures are bounded."""
+    """A scene and the renderer whose pictures are bounded."""
 
     #: What bounds of this program are called: "float32-sound" or "real-sound".
     guarantee: str
@@ -396,17 +397,17 @@ class Method(Protocol):
 
     @property
     def notes(self) -> Sequence[str]:
-        """What was assumed on reading the scene, one sentence each."""
+        """Sentences on what was assumed when the scene was read."""
         ...
 
     @property
     def dataset_scale(self) -> float | None:
-        """Normalised units per unit of the data set; None: the scene does not say."""
+        """Normalised units per unit of the data set; None: unknown."""
         ...
 
     @property
     def program(self) -> dict[str, Any]:
-        """``name`` and ``version`` of the bounded program, and what else tells it from others."""
+        """``name`` and ``version`` of the bounded renderer, and what else identifies it."""
         ...
 
     @property
@@ -416,46 +417,46 @@ class Method(Protocol):
 
     @property
     def plan(self) -> tuple[str, ...]:
-        """What is left out for this scene, whatever the frame."""
+        """What is left out for this scene in every frame."""
         ...
 
     @property
     def fingerprint(self) -> dict[str, Any]:
-        """Scene and program, for results that are continued."""
+        """Identity of scene and renderer, for results that are continued."""
         ...
 
     def describe(self) -> dict[str, Any]:
-        """The scene for reports; ``name`` is among the keys."""
+        """Return the scene's description for reports; ``name`` is among the keys."""
         ...
 
     def prepare(self, perturbations: Sequence[Perturbation]) -> None:
-        """Find out what the scene itself may do; InputError: not with this scene."""
+        """Find the variations of the scene itself; InputError: not supported for this scene."""
         ...
 
     def memory(self, pixels: int, threads: int) -> int:
-        """Bytes that a process of so many threads needs beside the leaves to bound pictures of ``pixels``."""
+        """Return the bytes, without leaves, of a process with ``threads`` that bounds pictures of ``pixels``."""
         ...
 
     def frame(self, poses: PoseBox, sheared: bool = False, layers: bool = False) -> Frame:
-        """One frame.
+        """Return one frame.
 
-        ``sheared``: its box may count parameters otherwise than the set does, where that is tighter. ``layers``:
-        accumulation and expected depth stand behind the colours; InputError: this representation has none.
+        ``sheared``: its box may have sheared parameters, where that is tighter. ``layers``: accumulation and expected
+        depth follow the colours; InputError: this representation has none.
         """
         ...
 
     def ablations(self, poses: PoseBox) -> Iterator[tuple[str, Frame]]:
-        """What makes bounds of a set loose, in words, and its frame without that: not the one asked for."""
+        """Yield causes of looseness of a set's bounds, in words, each with the frame without it."""
         return iter(())
 
     def attribution(self, frame: Frame, box: ParameterBox, tile: int, count: int) -> list[tuple[int, float]]:
-        """Scene elements without which the mean gap of a tile over a cell is less, and by how much, in that order."""
+        """Return scene elements whose removal narrows a tile's mean gap over a cell, with the amount, largest first."""
         return []
 
     def elements(self) -> SceneElements | None:
-        """What can be drawn of the scene as it is seen from outside; None: nothing has a place of its own."""
+        """Return the scene's elements for drawings from outside; None: they have no positions."""
         return None
 
     def differentiable(self, poses: PoseBox) -> Callable[[torch.Tensor], torch.Tensor] | None:
-        """Parameter values [d] to the picture [H, W, 3], differentiable; None: there are no certificates of it."""
+        """Return a function from parameter values [d] to the picture [H, W, 3], differentiable; None: unsupported."""
         return None

@@ -23,7 +23,7 @@ _AT_ONCE = 1 << 15
 
 
 class ArrayRecord:
-    """A record of arrays; its text has their shapes and types in place of their numbers."""
+    """A record of arrays whose text has their shapes and types in place of their numbers."""
 
     def __repr__(self) -> str:
         texts = []
@@ -39,8 +39,8 @@ class ArrayRecord:
 class TracePoint:
     """The state after ``seconds`` of work on a frame and ``cells`` bounded cells.
 
-    ``covered`` is the part of the set that the cells cover; nothing but [0, 1] holds of a pixel while that is below 1,
-    and ``mpg`` says so.
+    ``covered`` is the fraction of the set that the cells cover; while it is below 1, only [0, 1] holds, and ``mpg`` is
+    that of [0, 1].
     """
 
     seconds: float
@@ -72,9 +72,9 @@ class Leaves(ArrayRecord):
 class ExtraOutput(ArrayRecord):
     """A further output (depth, accumulation): bounds, sampled bounds and one render, [H, W] float32 each.
 
-    The accumulation is the part of the light that the scene takes, in [0, 1]. The expected depth is the mean of the
-    depths along the viewing axis, in units of the normalised frame, weighted as the colours are (gsplat's RGB+ED);
-    where nothing is drawn, it is the largest one of the picture. An upper bound of infinity says that nothing is known.
+    The accumulation is the sum of the blending weights, in [0, 1]. The expected depth is the mean of the depths along
+    the viewing axis, in units of the normalised frame, weighted as the colours are (gsplat's RGB+ED); where nothing is
+    drawn, it is the largest one of the picture. An upper bound of infinity means that none is known.
     """
 
     lower: Float32Array
@@ -88,7 +88,7 @@ class ExtraOutput(ArrayRecord):
         return float((self.upper.astype(np.float64) - self.lower).mean())
 
     def mean_gap_witness(self) -> float:
-        """The same of what was rendered."""
+        """Mean of ``witness_upper - witness_lower`` over the pixels."""
         return float((self.witness_upper.astype(np.float64) - self.witness_lower).mean())
 
 
@@ -99,7 +99,7 @@ EXTRA_OUTPUTS = ("depth", "accumulation")
 
 
 class RenderedMaximum(NamedTuple):
-    """The largest value of a rendered picture, over all pixels and channels, and the pose [d] that shows it."""
+    """The largest value of rendered pictures, over all pixels and channels, and the pose [d] that shows it."""
 
     value: float
     pose: tuple[float, ...]
@@ -112,7 +112,7 @@ def greater(*maxima: RenderedMaximum | None) -> RenderedMaximum | None:
 
 @dataclass(frozen=True, repr=False)
 class SampleImages(ArrayRecord):
-    """Concrete renders [n, H, W, 3] float32 at parameter values [n, d]; of a part of a frame in tiles."""
+    """Renders [n, H, W, 3] float32 at parameter values [n, d]; of a group of tiles in tiles."""
 
     values: Float64Array
     images: Float32Array
@@ -124,14 +124,14 @@ class AbstractPicture(ArrayRecord):
 
     Attributes:
         lower, upper: Enclose every image of the set, after background and clamp to [0, 1].
-        witness_lower, witness_upper: Least and largest values that were really rendered.
-        image: One concrete render, at the middle of the box.
+        witness_lower, witness_upper: Least and largest rendered values.
+        image: One render, at the middle of the box.
         bounded: False while no bound but [0, 1] is known (the budget ended first).
-        leaves: The leaf cells' linear sets, if they were asked for.
-        layers: What else was bounded, by name, of `EXTRA_OUTPUTS`.
-        views: Concrete renders across the set, where leaves are kept.
-        problems: What is wrong with the arithmetic of a process that bounded some of it; nothing is guaranteed then.
-        largest: Where a largest value was searched for: the largest one rendered, and its parameter values [d].
+        leaves: The leaf cells' linear sets, if they were requested.
+        layers: Further outputs by name, of `EXTRA_OUTPUTS`.
+        views: Renders across the set, where leaves are kept.
+        problems: Failed self-checks of the arithmetic of a process that bounded some of it; there is no guarantee then.
+        largest: If a largest value was searched for: the largest one rendered, and its parameter values [d].
     """
 
     index: int
@@ -154,19 +154,19 @@ class AbstractPicture(ArrayRecord):
 
 @dataclass(frozen=True, repr=False)
 class FrameResult(AbstractPicture):
-    """One frame's abstract image; ``plan``: what was left out for this frame and why, one sentence each."""
+    """One frame's abstract image; ``plan``: sentences on what was left out for this frame and why."""
 
     plan: tuple[str, ...] = ()
 
 
 @dataclass(frozen=True, repr=False, kw_only=True)
 class PartResult(AbstractPicture):
-    """Some tiles of a frame's abstract image; depths where anything is drawn, as a `Frame` has them.
+    """Some tiles of a frame's abstract image; depths only where something is drawn, as in a `Frame`.
 
     Attributes:
-        pixels: Number of the tiles' pixels that belong to the image, whose measures the trace has.
+        pixels: Number of the tiles' pixels that belong to the image, over which the trace's measures are taken.
         shown: Scene elements that some cell shows in these tiles, or None.
-        floor: What no more light comes to was left out of the first cover; 0: nothing.
+        floor: Light up to this amount was left out of the initial cells; 0: none was.
     """
 
     tiles: NDArray[np.int64]
@@ -180,10 +180,10 @@ _NOTHING = TracePoint(0.0, 0, math.sqrt(3.0), 0.0, 0.0)
 
 
 def joined(parts: Sequence[PartResult], camera: Any) -> FrameResult:
-    """Return the frame whose tiles are divided among ``parts``: cells are those of all, its time is the longest.
+    """Return the frame whose tiles are divided among ``parts``: cells are added up, its time is the longest.
 
     Raises:
-        ValueError: Parts of different frames, or a tile that is missing or there twice.
+        ValueError: The parts are of different frames, or a tile is missing or there twice.
     """
     first = parts[0]
     side = first.lower.shape[1]
@@ -229,7 +229,7 @@ def joined(parts: Sequence[PartResult], camera: Any) -> FrameResult:
 
 
 def _whole_depth(depth: ExtraOutput, accumulation: ExtraOutput) -> ExtraOutput:
-    """The expected depth [H, W] also where nothing is drawn: the largest one of the picture (design.md, D4)."""
+    """Return the expected depth [H, W], where nothing is drawn the largest one of the picture (design.md, D4)."""
     never, perhaps = depth.lower > depth.upper, ~(accumulation.lower > 0.0)
     # of every picture of the set, the largest depth lies between these
     most = np.where(never, 0.0, depth.upper).max(initial=0.0)
@@ -246,7 +246,7 @@ def _whole_depth(depth: ExtraOutput, accumulation: ExtraOutput) -> ExtraOutput:
 
 
 def _joined_trace(parts: Sequence[PartResult]) -> tuple[TracePoint, ...]:
-    """Sums of cells and means by pixels, whenever a part has a new point; before its first one, nothing is known."""
+    """Return the trace of sums of cells and means by pixels, with a point for each point of a part."""
     if len(parts) == 1:
         return parts[0].trace
     times = [[point.seconds for point in part.trace] for part in parts]
@@ -265,7 +265,7 @@ def _joined_trace(parts: Sequence[PartResult]) -> tuple[TracePoint, ...]:
 
 
 def _joined_views(parts: Sequence[SampleImages | None], order: NDArray[np.intp], camera: Any) -> SampleImages | None:
-    """The poses that every part has rendered, in their common order."""
+    """Return the renders at poses that every part has rendered, in their common order."""
     available = [part for part in parts if part is not None]
     if len(available) < len(parts):
         return None
@@ -277,7 +277,7 @@ def _joined_views(parts: Sequence[SampleImages | None], order: NDArray[np.intp],
 
 
 def _joined_leaves(parts: Sequence[Leaves | None]) -> Leaves | None:
-    """All leaves, ordered by box and tile."""
+    """Return all leaves, ordered by box and tile."""
     available = [part for part in parts if part is not None]
     if len(available) < len(parts):
         return None
@@ -290,7 +290,7 @@ def _joined_leaves(parts: Sequence[Leaves | None]) -> Leaves | None:
 
 
 def gap(lower: NDArray[np.floating], upper: NDArray[np.floating]) -> Float64Array:
-    """[H, W] Euclidean length over RGB of ``upper - lower``."""
+    """Return the Euclidean length [H, W] over RGB of ``upper - lower``."""
     length = np.empty(lower.shape[:-1])
     # a few rows at a time: what is between stays in the processor's cache
     step = max(1, _AT_ONCE * len(length) // max(1, length.size))
@@ -307,12 +307,12 @@ def gap(lower: NDArray[np.floating], upper: NDArray[np.floating]) -> Float64Arra
 
 
 def mean_pixel_gap(lower: NDArray[np.floating], upper: NDArray[np.floating]) -> float:
-    """MPG: the mean of `gap` over the pixels."""
+    """Return MPG: the mean of `gap` over the pixels."""
     return float(gap(lower, upper).mean())
 
 
 def max_pixel_gap(lower: NDArray[np.floating], upper: NDArray[np.floating]) -> float:
-    """XPG: the maximum of `gap` over the pixels."""
+    """Return XPG: the maximum of `gap` over the pixels."""
     return float(gap(lower, upper).max())
 
 

@@ -1,4 +1,4 @@
-"""A set of pictures as the first layer of a network, for verifiers of networks."""
+"""A set of pictures as the first layer of a network, for network verifiers."""
 
 from __future__ import annotations
 
@@ -26,5 +26,5 @@ class LinearRenderer(torch.nn.Module):
         self.register_buffer("radius", torch.from_numpy(np.ascontiguousarray(radius.transpose(2, 0, 1))[None]))
 
     def forward(self, parameters: torch.Tensor, slack: torch.Tensor) -> torch.Tensor:
-        """Pictures [n, 3, H, W] for parameters [n, d] and slacks [n, 3, H, W]."""
+        """Return pictures [n, 3, H, W] for parameters [n, d] and slacks [n, 3, H, W]."""
         return self.linear(parameters).reshape(-1, *self.shape) + self.radius * slack

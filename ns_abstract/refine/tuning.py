@@ -1,4 +1,4 @@
-"""Preferences of refinement. They decide how soon bounds are tight; bounds are sound whatever they are."""
+"""Preferences of refinement: they affect how soon bounds are tight, never whether they are sound."""
 
 from __future__ import annotations
 
@@ -7,35 +7,35 @@ from dataclasses import dataclass
 
 @dataclass(frozen=True)
 class Tuning:
-    """How a refinement divides its time and memory.
+    """How a refinement divides its time and memory. "Excess" is MPG beyond the witness MPG.
 
     Attributes:
         first_motion: Largest image motion (pixels) of a median Gaussian across one initial cell of one parameter.
         first_motions: The same along each of several parameters.
-        aim_share: The initial partition of one parameter aims at this part of the excess that the goal allows.
-        coarser_share: Where so small a part of the cells that were tried seems enough, a coarser one is tried.
-        aim_ratio: It aims at a goal of at least this ratio.
-        helpful_share: Halving an initial cell of one parameter helps if it leaves at most this part of the excess.
-        clipped_share: Part of the largest possible excess from which on [0, 1] may clip it, so that it does not fall.
-        aim_multiple: The initial partition of several parameters aims at so many times the excess that the goal allows.
-        helpful_halving: Halving an initial cell of several parameters helps if it leaves at most this part.
-        patience: So many halvings together may help as little as one should, where two axes matter as much.
-        patient_multiple: They may do so only from so many times the aim on.
-        sampled_tiles: From so many tiles on, some of them tell how many initial cells of one parameter are tried first.
-        tiles_a_sample: One of so many.
-        initial_time_share: Part of the time budget that the initial partition may take.
-        most_cell_pictures: A cell may take as long as rendering so many pictures.
-        cover_groups: Groups of tiles that are bounded one after another where time may end before all of them are.
-        cover_seconds: They get so many seconds at least, or so many more than the rest of the work.
-        most_initial_cells: Most cells of the initial partition.
-        round_share: Part of the whole excess that one round of splitting takes on.
-        looks: Times in a round that the goal is checked.
-        wide_split_excess: Excess over what the goal allows from which on cells are cut into the most parts at once.
-        closed_share: Part of the allowed excess that a leaf may leave open at a pixel for good.
-        narrowest: Cells narrower than this part of the set are not split: rounding rules there.
-        least_seconds: Least time that a cell is taken to need.
-        most_corners: Most corners of the set that are rendered.
-        early_corners: About as many of them are rendered before the initial partition.
+        aim_share: The initial partition of one parameter aims at this fraction of the allowed excess.
+        coarser_share: Where this small a fraction of the tried cells seems enough, a coarser partition is tried.
+        aim_ratio: Least target ratio that the initial partition aims at.
+        helpful_share: Halving an initial cell of one parameter helps if it leaves at most this fraction of the excess.
+        clipped_share: From this fraction of the largest possible excess on, [0, 1] may clip it, so it does not fall.
+        aim_multiple: The initial partition of several parameters aims at this multiple of the allowed excess.
+        helpful_halving: Halving an initial cell of several parameters helps if it leaves at most this fraction.
+        patience: Number of halvings that together may help as little as one, where two axes matter as much.
+        patient_multiple: They may do so only above this multiple of the aim.
+        sampled_tiles: From this many tiles on, the initial cells of one parameter are chosen by a sample of tiles.
+        tiles_a_sample: One of this many tiles is sampled.
+        initial_time_share: Fraction of the time budget that the initial partition may take.
+        most_cell_pictures: A cell is expected to take at most the time of this many renders.
+        cover_groups: Groups of tiles that are bounded one after another where time may end before all are.
+        cover_seconds: They get at least this many seconds, or as many more than the rest of the work.
+        most_initial_cells: Largest number of cells of the initial partition.
+        round_share: Fraction of the whole excess that one round of splitting handles.
+        looks: How often the goal is checked in a round.
+        wide_split_excess: From this excess over the allowed one on, cells are cut into the most parts at once.
+        closed_share: Fraction of the allowed excess that a leaf may leave open at a pixel for good.
+        narrowest: Cells narrower than this fraction of the set are not split: rounding dominates there.
+        least_seconds: Least time that a cell is assumed to need.
+        most_corners: Largest number of rendered corners of the set.
+        early_corners: About this many of them are rendered before the initial partition.
         scene_samples: Other scenes of the set that are rendered at the middle.
         scene_samples_by_pose: The same at every other rendered pose.
         first_points: Points of the trace for the first initial cells, one each.

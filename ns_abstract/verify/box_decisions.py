@@ -1,4 +1,4 @@
-"""Decide whether a network has an unsafe output in a box of inputs: bounds, attacks, bisection, branch and bound.
+"""Decides whether a network has an unsafe output in a box of inputs: bounds, attacks, bisection, branch and bound.
 
 See docs/dev/design.md, V11.
 """
@@ -40,7 +40,7 @@ _BRANCHES = 1 << 20
 
 @dataclass(frozen=True)
 class BoxTuning:
-    """Preferences of the search over boxes; a verdict needs a proof or a run."""
+    """Preferences of the search over boxes; a verdict needs a proof or an execution of the network."""
 
     #: Starts and steps of the first attack on a region, and of the one on groups that resist a proof; what is no
     #: further from unsafe, relative to one, is run. After that part of the time the first attack descends no more.
@@ -74,7 +74,7 @@ _TUNING = BoxTuning()
 
 @dataclass(frozen=True)
 class Decision:
-    """The answer to an instance; with "sat" the input x [n] inside a region and the outputs y [k] for it in float32."""
+    """The answer to an instance; with "sat", an input x [n] inside a region and its float32 outputs y [k]."""
 
     word: Verdict
     x: np.ndarray | None = None
@@ -92,10 +92,10 @@ def decide(
     memory: int = 1 << 30,
     arithmetic: NetworkArithmetic = "float32",
 ) -> Decision:
-    """Search the regions for an input with an unsafe output and for a proof that there is none (V11).
+    """Return a decision after searching the regions for unsafe outputs and for a proof that there are none (V11).
 
-    ``run``, the program that counts, gives outputs [k] for one image [1, *input_shape] float32; only what it computes
-    is a counterexample. Bounds may take ``memory`` bytes; ``arithmetic`` is what a proof covers.
+    ``run`` executes the network in its runtime: outputs [k] for one image [1, *input_shape] float32; only its outputs
+    make a counterexample. Bounds may take ``memory`` bytes; ``arithmetic`` is the one that a proof covers.
     """
     search = _BoxSearch(network, run, deadline, memory, arithmetic)
     try:
@@ -110,7 +110,7 @@ def decide(
 
 @dataclass(frozen=True)
 class _SharedProperty:
-    """Regions, of ends [m, n], of which the same functions of the outputs are asked, with offsets [m, k]."""
+    """Regions with ends [m, n] that share the same functions of the outputs, with offsets [m, k]."""
 
     regions: Sequence[InputRegion]
     lower: np.ndarray
@@ -119,11 +119,14 @@ class _SharedProperty:
 
     @property
     def unsafe(self) -> UnsafeSet:
-        """Rows and groups; offsets are the first region's."""
+        """The functions (rows) and their groups, with the first region's offsets."""
         return self.regions[0].unsafe
 
     def value(self, y: torch.Tensor, which: np.ndarray, group: Sequence[int] | None) -> torch.Tensor:
-        """[B] of outputs [B, ...] for inputs of regions ``which``, of one ``group`` or all: unsafe where <= 0."""
+        """Return a value [B] for outputs [B, ...] of inputs in regions ``which``: unsafe where it is <= 0.
+
+        ``group``: the rows that count; None: all groups.
+        """
         rows = y.flatten(1) @ torch.from_numpy(self.unsafe.rows).T + torch.from_numpy(self.offset[which])
         wanted = self.unsafe.groups if group is None else [group]
         groups = [rows[:, list(one)].amax(1) for one in wanted if one]
@@ -131,7 +134,7 @@ class _SharedProperty:
 
 
 def _by_property(regions: Sequence[InputRegion]) -> Iterator[_SharedProperty]:
-    """The regions that are not empty, those together that ask for the same."""
+    """Yield the regions that are not empty, grouped by their functions of the outputs."""
     kinds: dict[tuple[bytes, Any], list[InputRegion]] = {}
     for region in regions:
         if not bool((region.lower > region.upper).any()):
@@ -169,7 +172,7 @@ class _BoxSearch:
         self.found: tuple[np.ndarray, np.ndarray] = (np.zeros(0), np.zeros(0))
 
     def decide(self, shared: _SharedProperty) -> bool:
-        """Whether a region has a counterexample, which `found` then is; `undecided` if that is not known."""
+        """Return whether a region has a counterexample, stored in `found`; sets `undecided` if that stays open."""
         start, self.descended = self.deadline.left, 0
         descent = self.deadline.within(_TUNING.first_share * start)
         if self._attack(shared, np.arange(len(shared.regions)), *_TUNING.first_attack, descent=descent):
@@ -189,7 +192,7 @@ class _BoxSearch:
     # ------------------------------------------------------------ proofs
 
     def _bisect(self, shared: _SharedProperty) -> bool:
-        """`decide` by cutting boxes in halves."""
+        """Do `decide` by bisecting boxes."""
         waiting: list[_Box] = list(zip(range(len(shared.regions)), shared.lower, shared.upper, strict=True))
         most = _WAITING + len(waiting)
         while waiting:
@@ -210,7 +213,7 @@ class _BoxSearch:
         return False
 
     def _assume(self, shared: _SharedProperty, which: int) -> bool:
-        """`decide` of one region by cutting it across inputs that dominate, and assuming phases of neurons (N16)."""
+        """Do `decide` for one region by cutting dominant inputs, then branching on activation phases (N16)."""
         waiting = [(shared.lower[which], shared.upper[which], shared.unsafe.groups)]
         attacked = False
         while waiting:
@@ -240,9 +243,9 @@ class _BoxSearch:
         left: Sequence[tuple[int, ...]],
         boxes: int,
     ) -> bool:
-        """Whether the groups that are ``left`` are proved by better intermediate bounds and by assuming phases.
+        """Return whether the open groups ``left`` are proved by tighter intermediate bounds and by branching.
 
-        ``boxes``: among so many is the time divided.
+        ``boxes``: the number of boxes that share the remaining time.
         """
         by_step = max(_TUNING.least_seconds, _TUNING.step_cost * self.by_bounds)
         allowed = _TUNING.lines_share * self.deadline.left / boxes
@@ -266,7 +269,7 @@ class _BoxSearch:
         return True
 
     def _dominated(self, lower: np.ndarray, upper: np.ndarray) -> list[tuple[np.ndarray, np.ndarray]] | None:
-        """Two halves of a box [n], cut across the input that moves the neurons most; None if none dominates."""
+        """Return two halves of a box [n], cut across the input that moves the neurons most; None if none dominates."""
         if not 0 < int((upper > lower).sum()) <= _TUNING.most_to_rank:
             return None
         parts = input_shares(self.network, lower, upper)
@@ -276,7 +279,7 @@ class _BoxSearch:
     def _tree(
         self, shared: _SharedProperty, which: int, images: ImageSets, steps: int, groups: Sequence[tuple[int, ...]]
     ) -> tuple[PhaseTree, list[tuple[int, ...]]]:
-        """A tree over bounds with so many steps for intermediate ones, and the groups that its root leaves open."""
+        """Return a tree over bounds with ``steps`` for intermediate ones, and the groups that its root leaves open."""
         start = self.deadline.left
         cells = NetworkBounds(
             self.bounded, images, self.memory, self.arithmetic, 1, intermediate_steps=steps,
@@ -292,7 +295,7 @@ class _BoxSearch:
         return tree, left
 
     def _images(self, lower: np.ndarray, upper: np.ndarray) -> ImageSets:
-        """Boxes [m, n]: every input that varies is a parameter, if they are few; p numbers them in their order."""
+        """Return boxes [m, n] as image sets; inputs that vary are the parameters, in order, if they are few."""
         varies = upper > lower
         # the program rounds an input to float32, and rounding keeps the order
         lower = np.minimum(lower, lower.astype(np.float32).astype(np.float64))
@@ -310,7 +313,7 @@ class _BoxSearch:
         return ImageSets(a, np.where(varies, middle, lower), a, np.where(varies, middle, upper), lower, upper)
 
     def _bound(self, shared: _SharedProperty, boxes: Sequence[_Box]) -> OutputBounds:
-        """Bounds of boxes, with slopes by all inputs."""
+        """Return bounds over boxes, with slopes by all inputs."""
         which, lower, upper = (np.stack(ends) for ends in zip(*boxes, strict=True))
         bounds = bound_outputs(
             self.bounded,
@@ -331,7 +334,7 @@ class _BoxSearch:
     def _value(
         self, shared: _SharedProperty, x: torch.Tensor, which: np.ndarray, group: Sequence[int] | None = None
     ) -> torch.Tensor:
-        """`_SharedProperty.value` of inputs."""
+        """Return `_SharedProperty.value` for inputs."""
         return shared.value(self.network(x.reshape(-1, *self.network.input_shape)), which, group)
 
     def _attack(
@@ -343,9 +346,9 @@ class _BoxSearch:
         groups: Sequence[Sequence[int]] | None = None,
         descent: Deadline | None = None,
     ) -> bool:
-        """Gradient descent by signs from middles, corners and random inputs; of several groups, each alone.
+        """Return whether signed gradient descent from middles, corners and random inputs finds a counterexample.
 
-        What is begun after ``descent`` is evaluated and not moved.
+        Of several ``groups`` each is attacked alone. Starts after ``descent`` are evaluated only.
         """
         # a few steps where there are many regions: most are tiny
         steps = min(steps, max(3, 4 * self.attacked // len(regions)))
@@ -367,7 +370,7 @@ class _BoxSearch:
         return False
 
     def _later(self, groups: int) -> tuple[int, int]:
-        """Starts and steps of the later attack: fewer where all would take too much of the time that is left."""
+        """Return starts and steps of the second attack: fewer where all would take too much of the remaining time."""
         starts, steps = _TUNING.later_attack
         allowed = _TUNING.later_share * self.deadline.left / (self.by_input * groups)
         part = min(1.0, max(0.0, allowed) / (starts * steps)) ** 0.5
@@ -382,7 +385,7 @@ class _BoxSearch:
         steps: int,
         group: Sequence[int] | None,
     ) -> bool:
-        """Whether descent from inputs of regions ``which``, with so many evaluations, finds a counterexample."""
+        """Return whether descent from inputs ``x`` of regions ``which``, with ``steps`` evaluations, is successful."""
         lower, upper = ends
         size = 0.25
         for left in reversed(range(steps)):
@@ -400,7 +403,7 @@ class _BoxSearch:
         return False
 
     def _probe(self, shared: _SharedProperty, boxes: Sequence[tuple[_Box, np.ndarray]]) -> bool:
-        """The middles of boxes (with slopes of planes below), and the corners where the planes are least."""
+        """Return whether the middles of boxes, or the corners where their lower planes are least, are unsafe."""
         x, which = [], []
         for (region, lower, upper), slopes in boxes:
             x.append(0.5 * (lower + upper))
@@ -411,7 +414,7 @@ class _BoxSearch:
             return self._any(shared, tried, regions, self._value(shared, tried, regions))
 
     def _any(self, shared: _SharedProperty, x: torch.Tensor, which: np.ndarray, value: torch.Tensor) -> bool:
-        """Whether one of the inputs that look unsafe is, for the program that counts."""
+        """Return whether one of the inputs with unsafe values is unsafe in the runtime, too."""
         order = torch.argsort(value)[:2].tolist()
         for k in order:
             if not float(value[k]) <= _TUNING.nearly_unsafe * (1.0 + abs(float(value[k]))):
@@ -450,7 +453,7 @@ def run_once(network: Network, run: Callable[[np.ndarray], np.ndarray], x: np.nd
 
 
 def proves(bounds: Any, groups: Sequence[Sequence[int]]) -> np.ndarray:
-    """Return [m] whether in every group some row is certainly positive; NaN proves nothing."""
+    """Return [m] whether every group has a row that is surely positive; NaN proves nothing."""
     positive = np.asarray(bounds.lower) > 0.0
     proved = np.ones(len(positive), bool)
     for group in groups:

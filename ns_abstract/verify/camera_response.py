@@ -23,21 +23,21 @@ ResponseName = Literal["brightness", "white balance", "gamma"]
 class CameraResponse:
     """A set of camera responses around the nominal one, whose factor or power is within ``radius`` < 1 of 1.
 
-    "brightness": all values times one factor; "white balance": each channel times its own; "gamma": all values to one
-    power. The result is clipped to [0, 1].
+    "brightness": one factor for all values; "white balance": one factor by channel; "gamma": one power for all values.
+    The result is clipped to [0, 1].
     """
 
     name: ResponseName
     radius: float
 
     def applied(self, picture: np.ndarray, values: np.ndarray) -> np.ndarray:
-        """The picture [..., 3] that the camera of ``values`` [3], one by channel, shows; float32."""
+        """Return the float32 picture [..., 3] of a camera with factors or powers ``values`` [3] by channel."""
         clipped = np.clip(np.asarray(picture, np.float64), 0.0, 1.0)
         applied = clipped**values if self.name == "gamma" else clipped * values
         return np.clip(applied, 0.0, 1.0).astype(np.float32)
 
     def scene_samples(self, frame: Frame, seed: int) -> Iterator[ResponseSample]:
-        """Cameras of the set, without end, the extreme ones first."""
+        """Yield camera responses of the set without end, the extreme ones first."""
         rng, count = np.random.default_rng(seed), 3 if self.name == "white balance" else 1
         for signs in itertools.product((-1.0, 1.0), repeat=count):
             yield ResponseSample(frame, self, np.broadcast_to(1.0 + self.radius * np.array(signs), 3))
@@ -48,7 +48,7 @@ class CameraResponse:
     def applied_to_sets(
         self, linear: LinearSets, lower: np.ndarray, upper: np.ndarray
     ) -> tuple[LinearSets, np.ndarray, np.ndarray]:
-        """Sets that hold what every camera makes of the pictures that ``linear``, ``lower`` and ``upper`` hold (V14).
+        """Return sets that contain the pictures of every camera for pictures in ``linear``, ``lower``, ``upper`` (V14).
 
         All are float32, rounded outward: A_lower [..., d], b_lower [...], A_upper, b_upper; lower, upper [...].
         """
@@ -100,15 +100,15 @@ class ResponseSample:
     def signed_gradient_step(
         self, box: ParameterBox, values: np.ndarray, score: Score, size: float
     ) -> tuple[np.ndarray, ResponseSample]:
-        """The other extreme; there are few of them, and no slopes."""
+        """Return the pose and the other extreme response; there are few responses, and no slopes."""
         return values, ResponseSample(self.frame, self.response, 2.0 - self.values)
 
     @property
     def nearest(self) -> ResponseSample:
-        """The first of the extreme ones."""
+        """Return the first of the extreme responses."""
         return next(self.response.scene_samples(self.frame, 0))
 
     @property
     def arrays(self) -> dict[str, np.ndarray]:
-        """Factors or powers by channel."""
+        """Return factors or powers by channel."""
         return {"response": np.array(self.values)}

@@ -1,4 +1,4 @@
-"""Boxes of whole grid units in a cell: what is cut off, and which sub-boxes are left (docs/dev/design.md, U3, U5)."""
+"""Boxes of whole grid units inside a cell: excluded slabs, and remaining sub-boxes (docs/dev/design.md, U3, U5)."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from ns_abstract.verify.cells import Cell, CellGrid
 
 
 def inner_cell(grid: CellGrid, cell: Cell, box: ParameterBox) -> Cell:
-    """The smallest part of a cell, in whole units, that holds all of ``box`` within it (U3)."""
+    """Return the smallest part of a cell, in whole units, that contains the intersection with ``box`` (U3)."""
     first, past = list(cell.first), list(cell.past)
     for k in range(grid.box.dimensions):
         low, high = grid.box.lower[k], grid.box.upper[k]
@@ -30,7 +30,7 @@ def inner_cell(grid: CellGrid, cell: Cell, box: ParameterBox) -> Cell:
 
 
 def slabs(cell: Cell, inner: Cell) -> Iterator[Cell]:
-    """Cells that tile what of ``cell`` lies outside of ``inner``."""
+    """Yield cells that tile ``cell`` without ``inner``."""
     for k in range(len(cell.first)):
         if cell.first[k] < inner.first[k]:
             yield replace(cell, past=(*cell.past[:k], inner.first[k], *cell.past[k + 1 :]))
@@ -41,7 +41,7 @@ def slabs(cell: Cell, inner: Cell) -> Iterator[Cell]:
 
 
 def aligned(cell: Cell, inner: Cell, bits: int) -> Cell:
-    """``inner`` grown within ``cell`` to grid lines that are multiples of a power of two, so that it can be halved."""
+    """Return ``inner`` grown within ``cell`` to multiples of 2^bits grid units, so that it can be halved."""
     first, past = list(inner.first), list(inner.past)
     for k, (a, b) in enumerate(zip(cell.first, cell.past, strict=True)):
         step = 1 << max(0, (b - a).bit_length() - bits)
@@ -50,14 +50,14 @@ def aligned(cell: Cell, inner: Cell, bits: int) -> Cell:
 
 
 def sub_box_counts(cell: Cell, most: np.ndarray) -> np.ndarray:
-    """Numbers of sub-boxes [d] along a cell's axes, powers of two that divide its units, at most ``most`` [d]."""
+    """Return numbers [d] of sub-boxes along a cell's axes: powers of two that divide its units, up to ``most`` [d]."""
     sizes = np.array(cell.past, np.int64) - np.array(cell.first, np.int64)
     # the largest power of two that divides
     return np.minimum(sizes & -sizes, most)
 
 
 def meeting(cell: Cell, counts: np.ndarray, part: Cell) -> np.ndarray:
-    """[counts] which sub-boxes of a cell, whose units ``counts`` divide, meet a ``part`` of it (U9)."""
+    """Return [counts] which sub-boxes of a cell, whose units ``counts`` divide, meet its ``part`` (U9)."""
     chosen = np.zeros(counts, bool)
     spans = []
     for first, past, n, a, b in zip(cell.first, cell.past, counts.tolist(), part.first, part.past, strict=True):
@@ -68,17 +68,17 @@ def meeting(cell: Cell, counts: np.ndarray, part: Cell) -> np.ndarray:
 
 
 def resolved(box: ParameterBox, counts: np.ndarray) -> bool:
-    """Whether the overlap of a cell's sub-boxes covers what grid lines are rounded by (B12, U5)."""
+    """Return whether the overlap of a cell's sub-boxes exceeds the rounding of grid lines (B12, U5)."""
     low, high = np.array(box.lower), np.array(box.upper)
     rounding = SUB_BOX_LINE_ROUNDING * (np.abs(low) + np.abs(high))
     return bool(counts.prod() >= 8 and (rounding <= SUB_BOX_LINES * 0.5 * (high - low)).all())
 
 
 def divided(cell: Cell, left: np.ndarray, filled: float) -> Iterator[tuple[Cell, bool]]:
-    """Cells that tile ``cell``, each with whether some of its sub-boxes are left (U5).
+    """Yield cells that tile ``cell``, each with whether some of its sub-boxes remain (U5).
 
-    ``left`` [counts]: which of its equal sub-boxes are; counts divide the cell's units. ``filled``: part of a box that
-    has to be left for it to become one cell.
+    ``left`` [counts]: which of its equal sub-boxes remain; counts divide the cell's units. ``filled``: the fraction of
+    a box that must remain for it to become one cell.
     """
     if not left.any():
         yield cell, False
@@ -104,7 +104,7 @@ def divided(cell: Cell, left: np.ndarray, filled: float) -> Iterator[tuple[Cell,
 
 
 def between(box: ParameterBox, least: Float64Array, most: Float64Array) -> ParameterBox:
-    """The part of a box whose scaled parameters may lie in [least, most], rounded outward (U3)."""
+    """Return the part of a box whose scaled parameters lie in [least, most], rounded outward (U3)."""
     for k in range(box.dimensions):
         low, high = box.lower[k], box.upper[k]
         middle = 0.5 * (low + high)

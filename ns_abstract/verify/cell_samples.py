@@ -1,4 +1,4 @@
-"""One cell of a search: concrete pictures with their margins, and bounds."""
+"""Rendered pictures of one cell of a search with their margins, and the cell's bounds."""
 
 from __future__ import annotations
 
@@ -23,16 +23,16 @@ Sample = tuple[np.ndarray, "SceneSample | None"]
 
 @dataclass
 class CellSamples:
-    """Concrete pictures of one cell, with their margins, and what bounds say of it.
+    """Rendered pictures of one cell with their margins, and the cell's bounds.
 
     Attributes:
-        outputs: [n] of the model, of the first sample.
+        outputs: [n] of the model, for the first sample.
         bound: A lower bound of the margin; None: there is none, for the ``reason``.
-        slopes: [d] what a cut along each parameter may gain.
-        cost: The part of the margin that the width of the sets costs, about; NaN: nobody knows.
-        cuts: Into how many parts to cut the cell along each parameter; empty: as slopes say.
+        slopes: [d] estimated gain of a cut along each parameter.
+        cost: Estimated loss of the margin by the width of the sets; NaN: unknown.
+        cuts: Number of parts to cut the cell into along each parameter; empty: decided by slopes.
         ends: Bounds over the cell's sub-boxes; None: there are none.
-        parts: That tile the cell, where some of them are decided.
+        parts: Parts that tile the cell, where some of them are decided.
     """
 
     cell: Cell
@@ -54,12 +54,12 @@ class CellSamples:
 
     @property
     def worst(self) -> int:
-        """The sample with the smallest margin that is a number."""
+        """The number of the sample with the smallest margin that is a number."""
         return int(np.argmin(np.where(np.isfinite(self.margins), self.margins, np.inf)))
 
     @property
     def poses(self) -> dict[bytes, np.ndarray]:
-        """Those that were looked at, each once."""
+        """The sampled poses, each once."""
         return {pose.tobytes(): pose for pose, _ in self.samples}
 
     def _where(self, holds: Callable[[float], bool]) -> set[bytes]:
@@ -67,17 +67,17 @@ class CellSamples:
 
     @property
     def broken(self) -> int:
-        """Poses at which the property fails, for some scene."""
+        """The number of poses at which the property fails for some scene."""
         return len(self._where(_fails))
 
     @property
     def undecided(self) -> int:
-        """Poses with a margin of which nothing is known: it is no finite number."""
+        """The number of poses with a margin that is not finite."""
         return len(self._where(_unknown))
 
     @property
     def hopeless(self) -> bool:
-        """Whether there is no pose at which the property was seen to hold for all scenes."""
+        """Whether the property holds for all scenes at no sampled pose."""
         return len(self._where(_spoilt)) == len(self.poses)
 
     @property
@@ -87,17 +87,17 @@ class CellSamples:
 
     @property
     def wavers(self) -> bool:
-        """Whether margins differ so much that there may be poses where the property fails."""
+        """Whether margins vary so much that there may be poses where the property fails."""
         finite = [margin for margin in self.margins if math.isfinite(margin)]
         return bool(finite) and 2.0 * min(finite) <= max(finite)
 
     @property
     def holds(self) -> bool:
-        """Whether the property was seen to hold at the first pose, the middle, for all scenes."""
+        """Whether the property holds for all sampled scenes at the first pose, the middle."""
         return self.samples[0][0].tobytes() not in self._where(_spoilt)
 
     def fresh_poses(self, generator: np.random.Generator, corners: int, random: int) -> list[np.ndarray]:
-        """At most so many corners and random poses that no sample has been yet."""
+        """Return at most ``corners`` corners and ``random`` random poses that have not been sampled."""
         box = self.box
         if not box.dimensions:
             return []
@@ -106,7 +106,7 @@ class CellSamples:
         return [pose for key, pose in fresh.items() if key not in self.poses]
 
     def check_proof(self, box: ParameterBox, bound: float) -> None:
-        """Compare the samples in ``box`` with a lower bound of the margin there (Q8).
+        """Check the samples in ``box`` against a proved lower bound of the margin there (Q8).
 
         Raises:
             ContradictionError: The property fails at one of them: a proof and a counterexample cannot both be right.
@@ -116,7 +116,7 @@ class CellSamples:
                 raise _contradiction(box, f"at least {bound}", margin, pose)
 
     def check_refutation(self, box: ParameterBox, bound: float) -> Sample:
-        """The first sample in ``box``, on which the margin is proved to be at most ``bound`` (Q8).
+        """Return the first sample in ``box``, over which the margin is proved to be at most ``bound`` (Q8).
 
         Raises:
             ContradictionError: The property holds at one of them.
@@ -128,7 +128,7 @@ class CellSamples:
         return inside[0][0]
 
     def _within(self, box: ParameterBox) -> list[tuple[Sample, float]]:
-        """The samples in ``box``, with their margins."""
+        """Return the samples in ``box`` with their margins."""
         pairs = zip(self.samples, self.margins, strict=True)
         return [(sample, margin) for sample, margin in pairs if box.contains(sample[0])]
 

@@ -22,7 +22,7 @@ _MOST_UNITS = 10**9
 
 @dataclass(frozen=True)
 class CutTuning:
-    """How cells are cut. It does not decide whether a bound holds."""
+    """Preferences on how cells are cut; soundness does not depend on them."""
 
     #: Part of a goal that cuts may miss it by, so that rounding does not cut once more.
     spare: float = 1e-9
@@ -33,8 +33,7 @@ class Cell:
     """Units ``first[k]`` to ``past[k]`` (exclusive) of the grid along each parameter; empty for a single pose.
 
     Attributes:
-        outliers: Numbers of a photo's pixels that are known to be outliers at every pose of the cell (U9), which does
-            not tell cells apart.
+        outliers: Numbers of a photo's pixels that are outliers at every pose of the cell (U9); ignored by comparisons.
     """
 
     first: tuple[int, ...]
@@ -49,9 +48,9 @@ class Cell:
 
 @dataclass(frozen=True)
 class CellGrid:
-    """The grid of a frame: each parameter cut into ``units[k]`` equal units, of which cells consist.
+    """The grid of a frame: each parameter's range cut into ``units[k]`` equal units, of which cells consist.
 
-    The search begins with ``coarse[k]`` parts.
+    The search begins with ``coarse[k]`` cells along each.
     """
 
     box: ParameterBox
@@ -60,12 +59,12 @@ class CellGrid:
 
     @classmethod
     def adaptive(cls, box: ParameterBox, coarse: Sequence[int]) -> CellGrid:
-        """A grid whose units are first cells halved `HALVINGS` times."""
+        """Return a grid whose units are initial cells halved `HALVINGS` times."""
         return cls(box, tuple(n << HALVINGS for n in coarse), tuple(coarse))
 
     @classmethod
     def fixed(cls, box: ParameterBox, partitions: Sequence[int], coarse: Sequence[int]) -> CellGrid:
-        """The grid of a fixed partition, as in the paper."""
+        """Return the grid of a fixed partition, as in the paper."""
         if len(partitions) != box.dimensions:
             raise InputError(
                 f"{len(partitions)} numbers, the set has {box.dimensions} parameters: {', '.join(box.names) or 'none'}",
@@ -82,25 +81,25 @@ class CellGrid:
         return math.prod(self.units)
 
     def end(self, axis: int, position: int) -> float:
-        """The parameter's value at a grid line."""
+        """Return the parameter's value at a grid line."""
         low, high = self.box.lower[axis], self.box.upper[axis]
         return high if position == self.units[axis] else low + (high - low) * (position / self.units[axis])
 
     def box_of(self, cell: Cell) -> ParameterBox:
-        """The cell as a box of parameters; neighbours share their ends exactly."""
+        """Return the cell as a box of parameters; neighbours share their ends exactly."""
         lower, upper = (tuple(itertools.starmap(self.end, enumerate(ends))) for ends in (cell.first, cell.past))
         return ParameterBox(self.box.names, self.box.units, lower, upper)
 
     def roots(self) -> list[Cell]:
-        """The first cells, in order."""
+        """Return the initial cells in order."""
         lines = [[n * i // c for i in range(c + 1)] for n, c in zip(self.units, self.coarse, strict=True)]
         spans = [list(itertools.pairwise(line)) for line in lines]
         return [Cell(tuple(a for a, _ in part), tuple(b for _, b in part)) for part in itertools.product(*spans)]
 
     def divide(self, cell: Cell, slopes: np.ndarray, shrink: float, most_parts: int) -> list[Cell]:
-        """The cell halved along the parameter with the largest slope, and so on; empty if it is one unit.
+        """Return parts of the cell, halved repeatedly along the parameter of the largest slope; empty for one unit.
 
-        ``slopes`` [d]: what a cut along each parameter may gain; there is one halving at least, until their sum is
+        ``slopes`` [d]: gain of a cut along each parameter. The cell is halved at least once, until the slopes' sum is
         ``shrink`` times smaller or there are ``most_parts`` parts.
         """
         gains = np.where(np.isfinite(slopes), slopes, 0.0)
@@ -122,7 +121,7 @@ class CellGrid:
         return [] if math.prod(parts) == 1 else self.cut(cell, parts)
 
     def cut(self, cell: Cell, parts: Sequence[int]) -> list[Cell]:
-        """The cell in ``parts[k]`` parts along each parameter, or in as many as it has units there."""
+        """Return the cell cut into ``parts[k]`` parts along each parameter, at most into its units."""
         sizes = [past - first for first, past in zip(cell.first, cell.past, strict=True)]
         parts = [min(n, size) for n, size in zip(parts, sizes, strict=True)]
         spans = [
@@ -133,9 +132,9 @@ class CellGrid:
 
 
 def initial_divisions(motion: np.ndarray, pixels: float) -> tuple[int, ...]:
-    """Return the number of initial cells along each parameter such that the picture moves by ``pixels`` in one.
+    """Return the numbers of initial cells along each parameter such that the picture moves by ``pixels`` in one.
 
-    Fewer where there would be too many: in several parameters the search finds where fine cells are needed.
+    They are fewer where there would be too many: in several parameters the search finds where fine cells are needed.
     """
     counts = [max(1, math.ceil(m / pixels)) if np.isfinite(m) else 1 for m in motion]
     while math.prod(counts) > _MOST_FIRST:

@@ -26,10 +26,10 @@ def rounded_sets(
 ) -> tuple[tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray], np.ndarray, np.ndarray]:
     """Return sets that contain the rounded pictures of those in ``linear``, ``lower`` and ``upper`` (V10).
 
-    Any program that computes 255 x + 1/2 with two roundings and cuts the fraction off, or takes the nearest whole
-    number, is enclosed. Linear sets keep their slopes and are half a step wider on each side; where the constant bound
-    is better at the middle of the cell, it is taken. All are float32, rounded outward: A_lower [..., d], b_lower [...],
-    A_upper, b_upper; lower, upper [...].
+    Any program is enclosed that computes 255 x + 1/2 with two roundings and truncates, or rounds to the nearest whole
+    number. Linear sets keep their slopes and are half a step wider on each side; where the constant bound is tighter at
+    the middle of the cell, it is taken. All are float32, rounded outward: A_lower [..., d], b_lower [...], A_upper,
+    b_upper; lower, upper [...].
     """
     low, high = (np.clip(np.asarray(bound, np.float64), 0.0, 1.0) * _STEPS for bound in (lower, upper))
     least = np.maximum(np.ceil(low - 0.5 - STEP), 0.0) / _STEPS * (1.0 - QUOTIENT)

@@ -111,7 +111,7 @@ def _extend(
     offset: np.ndarray,
     form: Form,
 ) -> None:
-    """Put the linear layer in front of the graph and the rows behind it."""
+    """Put the linear layer in front of the graph, and the rows of the property behind it."""
     graph = proto.graph
     A, c, r = planes
     n, d = A.shape
@@ -169,7 +169,7 @@ def _extend(
 
 
 def _vnnlib(d: int, n: int, groups: Sequence[Sequence[int]], k: int, notes: Sequence[str]) -> str:
-    """The box of (p, e) and the negated property of ``k`` rows, in VNN-LIB 1."""
+    """Return VNN-LIB 1 text: the box of (p, e) and the negated property of ``k`` rows."""
     lines = [f"; {note}" for note in notes]
     lines += [f"(declare-const X_{i} Real)" for i in range(d + n)]
     lines += [f"(declare-const Y_{i} Real)" for i in range(k)]

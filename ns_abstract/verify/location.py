@@ -1,8 +1,7 @@
-"""The search for poses that explain a photo, one block of cells at a time (docs/dev/design.md, Q).
+"""The search for poses that explain a photo, one block of cells at a time (docs/dev/design.md, U).
 
-Cells are those of the frame that is searched, whose parameters may be sheared: there, a cell of the same image motion
-is far larger. A cell is excluded ("certified" in the store's terms), or its pose explains the photo ("falsified"), or
-it is cut.
+Parameters may be sheared: cells with the same image motion are far larger then. A cell is excluded ("certified" in the
+store), or its pose explains the photo ("falsified"), or it is cut.
 """
 
 from __future__ import annotations
@@ -44,7 +43,7 @@ UNITS = 20
 
 @dataclass(frozen=True)
 class LocationTuning:
-    """Preferences of the search. None of them decides whether an excluded cell holds no pose of the photo."""
+    """Preferences of the search; soundness of excluding a cell does not depend on them."""
 
     #: From so many parameters on, pixels are bounded over cells of the image motion, so many along its two axes; part
     #: of it widens bounds all the same. Sub-boxes then cost a look at each pixel's motion cells, no bounds.
@@ -91,17 +90,17 @@ class LocationTuning:
 
 @dataclass(frozen=True)
 class LocationResult(BlockResult):
-    """The result of a block. ``best``: the rendered pose with the fewest outliers; None: nothing was rendered."""
+    """The result of a block of cells. ``best``: the rendered pose of fewest outliers; None: nothing was rendered."""
 
     best: FoundPose | None = None
 
 
 class LocationSearch:
-    """Examines cells of one set of poses.
+    """Examines cells of one pose set.
 
     Args:
-        frame: What is searched and bounded; its parameters may be sheared.
-        plain: The same set in its own parameters, for renders.
+        frame: The frame that is searched and bounded; its parameters may be sheared.
+        plain: The frame of the same set in its own parameters, for renders.
     """
 
     def __init__(
@@ -119,7 +118,7 @@ class LocationSearch:
 
     @cached_property
     def _pace(self) -> Float64Array:
-        """[d] pixels by unit of a parameter that typical scene elements move by."""
+        """Image motion [d] in pixels of typical scene elements by unit of each parameter."""
         box = self.frame.box
         motion = np.nan_to_num(np.asarray(self.frame.motion(box), np.float64), nan=0.0, posinf=0.0)
         # what moves nothing is cut for the bounds' sake now and then
@@ -128,7 +127,7 @@ class LocationSearch:
 
     @cached_property
     def _width_pace(self) -> Float64Array:
-        """[d] the same of what widens bounds; see `widths`. It may take seconds for large pictures."""
+        """The same [d] for the motion that widens bounds; see `widths`. It may take seconds for large pictures."""
         box = self.frame.box
         if not self.by_motion:
             return self._pace / self.along(box)
@@ -138,7 +137,7 @@ class LocationSearch:
 
     @property
     def sub_box_frame(self) -> SubBoxFrame | None:
-        """The frame, if cells are contracted and it bounds pixels over their sub-boxes."""
+        """The frame, if cells are contracted and it can bound pixels over their sub-boxes; else None."""
         return self.frame if self.contract and isinstance(self.frame, SubBoxFrame) else None
 
     @property
@@ -147,7 +146,7 @@ class LocationSearch:
         return self.has_parts and self.frame.box.dimensions >= self.tuning.many
 
     def along(self, box: ParameterBox) -> np.ndarray:
-        """[d] sub-boxes along the parameters of a cell."""
+        """Return the numbers [d] of sub-boxes along the parameters of a cell."""
         if self.by_motion:
             return shared_out(self.moved(box), self.tuning.sub_boxes)
         counts = np.ones(box.dimensions, np.int64)
@@ -156,7 +155,7 @@ class LocationSearch:
         return counts
 
     def first_cells(self) -> list[Cell]:
-        """The set's first cell, or its parts where it is too wide for bounds: several can be examined side by side."""
+        """Return the set's initial cell, or its parts where it is too wide for bounds: these run side by side."""
         (root,) = self.grid.roots()
         if self.width(self.grid.box) <= self.tuning.coarse[self.by_motion]:
             return [root]
@@ -165,20 +164,20 @@ class LocationSearch:
         return examination.children
 
     def moved(self, box: ParameterBox) -> Float64Array:
-        """[d] pixels that typical scene elements move by over a cell (an estimate)."""
+        """Return the estimated image motion [d] in pixels of typical scene elements over a cell."""
         return self._pace * (np.array(box.upper) - np.array(box.lower))
 
     def widths(self, box: ParameterBox) -> Float64Array:
-        """[d] pixels by which parameters widen bounds over a cell: motion that its parts do not follow (a guess)."""
+        """Return the estimated pixels [d] by which parameters widen bounds: motion that sub-boxes do not follow."""
         return self._width_pace * (np.array(box.upper) - np.array(box.lower))
 
     def width(self, box: ParameterBox) -> float:
-        """Norm of the `widths`."""
+        """Return the norm of the `widths`."""
         return float(np.linalg.norm(self.widths(box)))
 
     @cached_property
     def telling(self) -> TellingPixels:
-        """Which pixels of a cell are bounded: a guess, by one cell in the middle of the set."""
+        """The pixels of a cell that are bounded first: a heuristic, from one cell in the middle of the set."""
         box, least = self.frame.box, self.tuning.still
         reference = self.tuning.reference[self.has_parts + self.by_motion]
         side = np.minimum(1.0, reference / math.sqrt(max(1, box.dimensions)) / np.maximum(self.widths(box), least))
@@ -188,7 +187,7 @@ class LocationSearch:
         return TellingPixels(self.tiled, self.frame.camera, typical)
 
     def motion_cells(self, box: ParameterBox) -> MotionCells | None:
-        """Those of a cell, if the frame bounds pixels over them."""
+        """Return the motion cells of a cell, if the frame can bound pixels over them; else None."""
         frame = self.sub_box_frame
         if frame is None or box.dimensions < 2:
             return None
@@ -196,14 +195,14 @@ class LocationSearch:
 
     @cached_property
     def moved_pictures(self) -> MovedPictures | None:
-        """Pictures near the middles of cells that the frame bounds over their sub-boxes."""
+        """Pictures near the middles of cells, for frames that bound pixels over sub-boxes."""
         frame = self.sub_box_frame
         if frame is None:
             return None
         return MovedPictures(self.frame, frame.motion_field, self.look)
 
     def look(self, values: Float64Array) -> tuple[np.ndarray, FoundPose]:
-        """Render the pose at sheared values; returns its tiles, and what it misses of the photo."""
+        """Render the pose at sheared values; return its tiles, and the pose with its outliers."""
         pose = self.original(values)
         picture = self.plain.render(pose)
         return picture, FoundPose(tuple(pose.tolist()), int(self.tiled.outside(picture).sum()))
@@ -214,13 +213,13 @@ class LocationSearch:
         return self.sub_box_frame is not None and self.frame.box.dimensions > 1
 
     def parts(self, box: ParameterBox) -> MotionCells | np.ndarray | None:
-        """The parts of a cell: motion cells, or numbers [d] of sub-boxes; None: it has none."""
+        """Return the parts of a cell: motion cells, or numbers [d] of sub-boxes; None: it has none."""
         if not self.has_parts:
             return None
         return self.motion_cells(box) if self.by_motion else self.along(box)
 
     def examine(self, cells: Sequence[Cell]) -> LocationResult:
-        """Exclude the cells, or cut them."""
+        """Exclude the cells, or cut them, and return the result."""
         begin = time.perf_counter()
         reports = [_Examination(self, cell, self.tiled.chosen(cell.outliers)) for cell in cells]
         for report in reports:
@@ -239,7 +238,7 @@ class LocationSearch:
         )
 
     def original(self, values: Float64Array) -> Float64Array:
-        """Parameters [d] of the set at sheared ``values`` [d], the nearest ones of the set."""
+        """Return the set's own parameters [d] at sheared ``values`` [d], clipped to the set."""
         box = self.plain.box
         by_name = dict(zip(self.frame.box.names, np.asarray(values, np.float64).tolist(), strict=True))
         for name, factors in self.frame.pose_set.shear.items():
@@ -249,10 +248,10 @@ class LocationSearch:
 
 @dataclass
 class _Examination:
-    """What becomes of one cell.
+    """The examination of one cell.
 
     Attributes:
-        inherited: [T, side, side] counted pixels that are outliers at every pose of the cell, by bounds over more (U9).
+        inherited: [T, side, side] counted pixels that are outliers at all poses, by bounds over an enclosing cell (U9).
     """
 
     search: LocationSearch
@@ -270,7 +269,7 @@ class _Examination:
     divisions: tuple[Cell, np.ndarray, PixelRounds] | None = None
 
     def run(self) -> None:
-        """Exclude the cell, contract it and cut it."""
+        """Exclude the cell, or contract and cut it."""
         search, tuning = self.search, self.search.tuning
         if self.inherited.sum() > search.tiled.allowed:
             return self._exclude(1.0)
@@ -299,11 +298,11 @@ class _Examination:
 
     @property
     def done(self) -> bool:
-        """Whether what is left of the cell has a verdict."""
+        """Whether every remaining part of the cell has a verdict."""
         return bool(self.leaves) and self.leaves[-1].cell == self.cell
 
     def _sub_boxes(self, box: ParameterBox) -> bool | None:
-        """Exclude sub-boxes of the cell; returns whether some were, or None: the frame has no bounds of sub-boxes."""
+        """Exclude sub-boxes of the cell; return whether any was, or None if the frame cannot bound sub-boxes."""
         search, tuning = self.search, self.search.tuning
         frame, cells = search.sub_box_frame, search.motion_cells(box)
         counts = sub_box_counts(self.cell, search.along(box))
@@ -339,7 +338,7 @@ class _Examination:
         return True
 
     def heir(self, part: Cell) -> Cell:
-        """A part of the cell, with the pixels that are known to be outliers at all of its poses (U9)."""
+        """Return a part of the cell, with the pixels that are known to be outliers at all of its poses (U9)."""
         pixels = self.inherited
         if self.divisions is not None:
             cell, counts, rounds = self.divisions
@@ -350,7 +349,7 @@ class _Examination:
         self.leaves.append(FinishedCell(self.cell, "certified", margin, 0.0))
 
     def _shrink(self, box: ParameterBox) -> None:
-        """Exclude what of the cell lies outside of ``box``, in whole grid units."""
+        """Exclude the cell outside of ``box``, in whole grid units."""
         inner = inner_cell(self.search.grid, self.cell, box)
         if float(np.linalg.norm(self.search.moved(box))) > self.search.tuning.contracted:
             inner = aligned(self.cell, inner, self.search.tuning.aligned)
@@ -358,14 +357,14 @@ class _Examination:
         self.cell = inner
 
     def _look(self, values: Float64Array) -> tuple[np.ndarray, int]:
-        """Render the pose at sheared values; returns its tiles, and how many pixels it does not explain."""
+        """Render the pose at sheared values; return its tiles, and the number of outliers."""
         picture, pose = self.search.look(values)
         if self.best is None or pose.outliers < self.best.outliers:
             self.best = pose
         return picture, pose.outliers
 
     def _glance(self, box: ParameterBox) -> np.ndarray:
-        """About the tiles that the middle of a cell shows."""
+        """Return approximate tiles of the picture at the middle of a cell."""
         moved = self.search.moved_pictures
         nearby = None if moved is None else moved.near(box)
         if nearby is None:
@@ -375,11 +374,11 @@ class _Examination:
 
     @property
     def explained(self) -> bool:
-        """Whether a pose that was rendered explains the photo."""
+        """Whether a rendered pose explains the photo."""
         return self.best is not None and self.best.outliers <= self.search.tiled.allowed
 
     def _whole(self, box: ParameterBox, picture: np.ndarray, number: int) -> bool:
-        """Bound the cell without sub-boxes, in rounds of pixels, and exclude it or contract it by these (U8).
+        """Bound the cell without sub-boxes, in rounds of pixels, and exclude or contract it (U8).
 
         Returns:
             Whether the cell was contracted.
@@ -425,7 +424,7 @@ class _Examination:
                 return True
 
     def _rounds(self, box: ParameterBox, picture: np.ndarray, counts: np.ndarray) -> tuple[PixelRounds, PixelOrder]:
-        """Rounds of pixels for the sub-boxes [counts] of the cell, and the pixels that they choose from."""
+        """Return rounds of pixels for the sub-boxes [counts] of the cell, and the order of candidate pixels."""
         search, tiled, tuning = self.search, self.search.tiled, self.search.tuning
         moved, needed = float(np.linalg.norm(search.moved(box))), tiled.allowed + 1 - int(self.inherited.sum())
         parts, frame = bool(counts.prod() > 1), search.sub_box_frame
@@ -437,7 +436,7 @@ class _Examination:
         return PixelRounds(tiled, int(np.prod(counts)), self.inherited, tuning.pixel_rounds), chosen
 
     def _bound(self, box: ParameterBox, tiles: np.ndarray, linear: bool, pixels: np.ndarray | None = None) -> Bounds:
-        """Bounds of ``tiles``, or of some of their ``pixels`` alone where the frame can leave out the others."""
+        """Return bounds of ``tiles``, or of ``pixels`` in them alone where the frame supports that."""
         check_cancelled()
         self.bounded += 1
         frame = self.search.frame
@@ -445,7 +444,7 @@ class _Examination:
         return frame.bound_parts([box], tiles, within, linear, pixels)[0]
 
     def _settled(self, known: BoundedPixels) -> bool:
-        """Whether every pose of the cell explains the photo: it is finished then."""
+        """Finish the cell and return True if every pose of it explains the photo."""
         tiled = self.search.tiled
         if int(tiled.counted.sum()) - known.explained > tiled.allowed or not self.explained:
             return False
@@ -453,7 +452,7 @@ class _Examination:
         return True
 
     def _contracted(self, box: ParameterBox, known: BoundedPixels) -> bool:
-        """Exclude what of the cell the pixels' linear bounds rule out; returns whether anything is left of it."""
+        """Exclude the part of the cell that the pixels' linear bounds rule out; return whether anything remains."""
         least, most = known.reach
         if (least > most).any():
             self._exclude(1.0)
@@ -462,7 +461,7 @@ class _Examination:
         return True
 
     def _finish(self) -> None:
-        """End with the cell as it is: possible if a rendered pose explains the photo."""
+        """Finish the cell without cutting it: possible if a rendered pose explains the photo."""
         if self.explained:
             assert self.best is not None
             margin = float(self.best.outliers - self.search.tiled.allowed)
@@ -472,7 +471,7 @@ class _Examination:
         self.leaves.append(leaf)
 
     def cut(self) -> None:
-        """Cut what is left of the cell where the picture moves most."""
+        """Cut the remaining cell where the picture moves most."""
         search, tuning = self.search, self.search.tuning
         if self.cell.volume <= max(1.0, tuning.finest ** len(self.cell.first) * search.grid.volume):
             return self._finish()

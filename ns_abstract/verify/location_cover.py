@@ -1,4 +1,4 @@
-"""Boxes of a set's own parameters that hold all poses of sheared cells (docs/dev/design.md, U4)."""
+"""Boxes in a set's own parameters that contain all poses of sheared cells (docs/dev/design.md, U4)."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ _PARTS = 8
 
 @dataclass(frozen=True)
 class PoseCover:
-    """A set cut into cells that tile it: those that hold what is left, and those that hold none of it."""
+    """A set cut into cells that tile it: those with possible poses, and those without."""
 
     grid: CellGrid
     left: tuple[Cell, ...]
@@ -31,12 +31,12 @@ class PoseCover:
 
     @property
     def volume(self) -> float:
-        """Part of the set that is left."""
+        """The fraction of the set in cells with possible poses."""
         return sum(cell.volume for cell in self.left) / self.grid.volume
 
     @property
     def hull(self) -> ParameterBox | None:
-        """The smallest box of the set around all that is left; None: nothing is."""
+        """The smallest box of the set around all cells with possible poses; None: there are none."""
         if not self.left:
             return None
         first = tuple(min(cell.first[k] for cell in self.left) for k in range(len(self.grid.units)))
@@ -45,7 +45,7 @@ class PoseCover:
 
 
 class ShearedBoxes:
-    """Boxes of sheared parameters, and where they are in the set's own.
+    """Boxes of sheared parameters, and enclosures of them in the set's own parameters.
 
     Args:
         shear: As of `PoseBox`: name to other to factor.
@@ -61,7 +61,7 @@ class ShearedBoxes:
         ]
 
     def volume_within(self, box: ParameterBox) -> float:
-        """The volume of the boxes' poses that lie in ``box``, at most: a sum over parts of them."""
+        """Return an upper bound of the volume of the boxes' poses in ``box``, a sum over parts of the boxes."""
         lower, upper = (np.array(end) for end in (box.lower, box.upper))
         sheared = [axis for axis, _ in self._terms]
         plain = [axis for axis in range(len(lower)) if axis not in sheared]
@@ -89,7 +89,7 @@ class ShearedBoxes:
         return total
 
     def within(self, box: ParameterBox, chosen: np.ndarray) -> tuple[np.ndarray, Float64Array, Float64Array]:
-        """Which boxes of ``chosen`` [m] may have poses in ``box``, and ends [m, d] around these, rounded outward."""
+        """Return which boxes of ``chosen`` [m] may have poses in ``box``, and ends [m, d] around these poses."""
         box_lower, box_upper = np.array(box.lower), np.array(box.upper)
         own_lower, own_upper = self.lower[chosen], self.upper[chosen]
         lower, upper = np.maximum(own_lower, box_lower), np.minimum(own_upper, box_upper)
@@ -117,9 +117,9 @@ class ShearedBoxes:
 def cover(
     box: ParameterBox, boxes: ShearedBoxes, most_cells: int = MOST, late: Callable[[], bool] = lambda: False
 ) -> PoseCover:
-    """Tile a set by cells of its own parameters, about ``most_cells`` of which hold what is in ``boxes``.
+    """Return a tiling of a set by cells of its own parameters, about ``most_cells`` of which meet ``boxes``.
 
-    ``late``: whether there is no more time; cells are not cut from then on.
+    ``late``: whether the time is over; cells are not cut from then on.
     """
     d = box.dimensions
     grid = CellGrid(box, (1 << UNITS,) * d, (1,) * d)
@@ -161,7 +161,7 @@ def cover(
 
 
 def _hull_volume(grid: CellGrid, boxes: ShearedBoxes, parts: list[Cell], chosen: np.ndarray) -> float:
-    """Volume of the hulls of what is in each of the parts."""
+    """Return the volume of the hulls of the boxes' parts in each of the cells."""
     if len(parts) == 1:
         return np.inf
     total = 0.0

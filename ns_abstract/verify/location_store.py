@@ -26,7 +26,7 @@ class LocationStore(Store):
     """A `Store` of cells of sheared parameters.
 
     Attributes:
-        cover: Makes the cells of a frame's own parameters from what is left; set before `finish`.
+        cover: Makes cells in a frame's own parameters from the possible cells; set before `finish`.
     """
 
     cover: Callable[[int], PoseCover]
@@ -54,7 +54,7 @@ class LocationStore(Store):
         return True
 
     def poses(self, frame: int) -> list[FoundPose]:
-        """Rendered poses of a frame, the best first, in the order of its parameters."""
+        """Return rendered poses of a frame, the best first, in the order of its parameters."""
         query = "SELECT radius, lower FROM search_settled WHERE kind = ? AND frame = ? ORDER BY radius, rowid"
         return [
             FoundPose(tuple(json.loads(values)), int(outliers))
@@ -62,7 +62,7 @@ class LocationStore(Store):
         ]
 
     def left(self, frame: int) -> list[Cell]:
-        """Cells of the search that are not excluded."""
+        """Return the cells of the search that are not excluded."""
         rows = self._base.execute(
             "SELECT lower, upper FROM search_settled WHERE kind = ? AND frame = ?", (_CELL, int(frame))
         ).fetchall()
@@ -70,7 +70,7 @@ class LocationStore(Store):
         return cells + [cell for block in self._listed("ORDER BY id") if block.frame == frame for cell in block.cells]
 
     def finish(self, grids: Mapping[int, CellGrid]) -> None:
-        """Write the table ``cells``; `Store` takes it back on resuming."""
+        """Write the table ``cells``; `Store` reverts that on resuming."""
         covers = {frame: self.cover(frame) for frame in grids}
         with self._transaction():
             rows = []

@@ -20,10 +20,10 @@ def descend(
     steps: int,
     enough: Callable[[float], bool],
 ) -> np.ndarray | None:
-    """Return the pose [d] of the box with the least value that was found; None: no step was better than ``start`` [d].
+    """Return the pose [d] of the box with the least value found; None: no step was better than ``start`` [d].
 
-    Steps follow the normalised gradient in parameters scaled to [-1, 1]^d; they double where the value fell and shrink
-    to a quarter where not.
+    Steps follow the normalised gradient in parameters scaled to [-1, 1]^d; they double where the value fell, and shrink
+    to a quarter elsewhere.
 
     Args:
         box: Limits of the parameters.

@@ -45,15 +45,15 @@ class NetworkModel:
 
     @cached_property
     def _run(self) -> Callable[[np.ndarray], np.ndarray]:
-        """Runs the file in onnxruntime. Raises InputError where it is another one than was read."""
+        """Return a function that runs the file in onnxruntime. InputError where the file has changed meanwhile."""
         run = onnx_runner(self.network.source, self.network.output, self.network.input_shape)
         require_unchanged(self.network)
         return run
 
     def outputs(self, images: np.ndarray) -> np.ndarray:
-        """[B, n] of onnxruntime in float32, picture by picture.
+        """Return outputs [B, n] of onnxruntime in float32, picture by picture.
 
-        With network arithmetic real: of the same weights in float64.
+        With network arithmetic "real": of the same weights in float64.
         """
         with torch.no_grad():
             inputs = self.preprocess.apply(torch.from_numpy(np.asarray(images, np.float32)))
@@ -75,7 +75,7 @@ class NetworkModel:
         return reusable_anywhere(self.network)
 
     def shared_bounds(self, images: ImageSets) -> ModelSharedBounds:
-        """Bounds of one cell, whose rows can serve for others (N15)."""
+        """Return bounds of one cell, whose coefficients can bound others (N15)."""
         shared = SharedCoefficients(self.network, parametric(images), memory=self.memory, arithmetic=self.arithmetic)
         return ModelSharedBounds(shared)
 
@@ -88,9 +88,9 @@ class NetworkModel:
 
     @subnormals_kept()
     def branch(self, images: ImageSets, query: Query, groups: Sequence[Sequence[int]], most_branches: int) -> float:
-        """A lower bound of the margin ``min over groups of max over its rows`` in the one cell of ``images``.
+        """Return a lower bound of the margin ``min over groups of max over its rows`` in the one cell of ``images``.
 
-        It is positive if ``most_branches`` branches on the phases of neurons prove every group (N16).
+        It is positive if at most ``most_branches`` branches on activation phases prove every group (N16).
         """
         cells = NetworkBounds(self.network, parametric(images), self.memory, self.arithmetic, 1)
         tree, least = PhaseTree(cells, query.rows, query.offset), np.inf
@@ -104,7 +104,7 @@ class NetworkModel:
 
 @dataclasses.dataclass(frozen=True)
 class ModelSharedBounds:
-    """Bounds of a cell, and of others with its coefficients; `fresh` ones bound the last activation anew."""
+    """Bounds of a cell, and of others with its coefficients; with ``fresh`` the last activation is refined anew."""
 
     shared_bounds: SharedCoefficients
 
@@ -116,7 +116,7 @@ class ModelSharedBounds:
 
 
 def parametric(images: ImageSets) -> ImageSets:
-    """Return the sets with at least one parameter; for a single pose one is added that moves nothing."""
+    """Return the sets with at least one parameter; single poses get one that moves nothing."""
     if images.dimensions:
         return images
     still = np.zeros((*images.b_lower.shape, 1))

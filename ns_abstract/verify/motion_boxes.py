@@ -1,4 +1,4 @@
-"""Which sub-boxes of a cell of poses are excluded by pixels that exclude cells of the image motion (design.md, U11)."""
+"""Excludes sub-boxes of a cell of poses by pixels that exclude cells of the image motion (docs/dev/design.md, U11)."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from ns_abstract.geometry.motion_cells import MotionCells, square_numbers
 
 
 class MotionBoxes:
-    """Sub-boxes of a cell, and the motion cells that the poses of each may show at each pixel (design.md, U11).
+    """Sub-boxes of a cell, and the motion cells that each may show at each pixel (docs/dev/design.md, U11).
 
     Args:
         cells: Motion cells of the cell.
@@ -20,7 +20,7 @@ class MotionBoxes:
         camera: Of the picture.
 
     Attributes:
-        moved: [k, 2] columns and rows that the picture moves by from the cell's middle to that of each sub-box.
+        moved: [k, 2] columns and rows by which the picture moves from the cell's middle to that of each sub-box.
     """
 
     def __init__(self, cells: MotionCells, counts: np.ndarray, camera: PinholeCamera) -> None:
@@ -30,9 +30,9 @@ class MotionBoxes:
         self.moved = self._middles @ cells.typical.T
 
     def excluded(self, excluding: np.ndarray, pixels: np.ndarray) -> np.ndarray:
-        """[n, k] which of the ``n`` ``pixels`` [T, side, side] exclude which of ``k`` sub-boxes.
+        """Return [n, k] which of the ``n`` ``pixels`` [T, side, side] exclude which of ``k`` sub-boxes.
 
-        A pixel that excludes all motion cells that a sub-box meets, by ``excluding`` [n, cells], excludes it.
+        A pixel excludes a sub-box if it excludes, by ``excluding`` [n, cells], all motion cells that the sub-box meets.
         """
         rows, columns = self.cells.counts.tolist()
         # cells that are kept before each line
@@ -49,9 +49,9 @@ class MotionBoxes:
 
 @njit(cache=True, error_model="numpy", nogil=True)
 def _excluded(kept, motion, middles, half, out):
-    """Set ``out`` [n, k]: whether none of the motion cells that each box ``middles`` [k, d] +- ``half`` meets is kept.
+    """Set ``out`` [n, k]: whether every motion cell that box ``middles`` [k, d] +- ``half`` meets is excluded.
 
-    What ends are rounded by is far below the overlap of the cells.
+    The rounding of ends is far below the overlap of the cells.
     """
     rows, columns, d = kept.shape[1] - 1, kept.shape[2] - 1, half.size
     for pixel in range(out.shape[0]):
@@ -73,5 +73,5 @@ def _excluded(kept, motion, middles, half, out):
 
 
 def warm_up() -> None:
-    """Compile what `MotionBoxes.excluded` needs."""
+    """Compile the kernels of `MotionBoxes.excluded`."""
     _excluded(np.zeros((1, 9, 9), np.int32), np.zeros((1, 4, 2)), np.zeros((1, 2)), np.ones(2), np.empty((1, 1), bool))

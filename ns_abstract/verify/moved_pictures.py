@@ -1,7 +1,7 @@
-"""What a pose shows, about: the picture of a pose near it, moved (docs/dev/design.md, U8).
+"""Approximates the picture at a pose by a rendered picture nearby, moved (docs/dev/design.md, U8).
 
-Pixels of a wide cell are chosen by the picture in its middle. One picture, drawn once, serves all cells nearby. It
-decides nothing but which pixels are bounded.
+Pixels of a wide cell are chosen by the picture in its middle. One rendered picture serves all cells nearby. It only
+affects which pixels are bounded.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ class FoundPose:
 
 @dataclass(frozen=True)
 class _Drawn:
-    """The picture [H, W, c] of the middle of a box, how it moves over the box, and what it misses of the photo."""
+    """The picture [H, W, c] of the middle of a box, its motion over the box, and its outliers."""
 
     box: ParameterBox
     picture: np.ndarray
@@ -42,12 +42,12 @@ class _Drawn:
 
 
 class MovedPictures:
-    """Pictures of the middles of boxes around cells, and what they show of the cells.
+    """Rendered pictures of the middles of boxes around cells, and approximations of cells from these.
 
     Args:
-        frame: What is searched.
-        field: Tells how the picture moves over a box.
-        look: Tells the picture's tiles at parameters of the frame, and what they miss of the photo.
+        frame: The frame that is searched.
+        field: Returns the picture's motion over a box.
+        look: Returns the picture's tiles at parameters of the frame, and the pose with its outliers.
     """
 
     def __init__(
@@ -60,7 +60,7 @@ class MovedPictures:
         self._boxes = EnclosingBoxes(frame.box, frame.motion, self._draw)
 
     def near(self, box: ParameterBox) -> tuple[np.ndarray, FoundPose] | None:
-        """About what the middle of ``box`` shows, in tiles, and the pose that was rendered.
+        """Return approximate tiles at the middle of ``box``, and the pose that was rendered.
 
         None: ``box`` reaches beyond the set.
         """

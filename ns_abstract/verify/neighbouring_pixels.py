@@ -1,4 +1,4 @@
-"""Ends and means of an image over the neighbourhood of each pixel, and images that show the same elsewhere."""
+"""Extremes and means of an image over the neighbourhood of each pixel, and shifted images."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ import numpy as np
 
 
 def nearby(image: np.ndarray, radius: int) -> tuple[np.ndarray, np.ndarray]:
-    """Least and greatest values [H, W, ...] of an image within so many pixels along both axes."""
+    """Return least and greatest values [H, W, ...] of an image within ``radius`` pixels along both axes."""
     least, most = image.copy(), image.copy()
     for axis in (0, 1):
         low, high = least.copy(), most.copy()
@@ -21,7 +21,7 @@ def nearby(image: np.ndarray, radius: int) -> tuple[np.ndarray, np.ndarray]:
 
 
 def smoothed(image: np.ndarray, radius: int) -> np.ndarray:
-    """Means of an image [H, W, ...] over squares of so many pixels to every side, repeated beyond its edges."""
+    """Return means of an image [H, W, ...] over squares of ``radius`` pixels to each side, edges repeated."""
     for axis in (0, 1):
         padding = [(radius + 1, radius) if k == axis else (0, 0) for k in range(image.ndim)]
         sums = np.cumsum(np.pad(image.astype(np.float64), padding, mode="edge"), axis=axis)
@@ -33,7 +33,7 @@ def smoothed(image: np.ndarray, radius: int) -> np.ndarray:
 
 
 def filled(image: np.ndarray, known: np.ndarray, radius: int, other: float) -> np.ndarray:
-    """An image [H, W, ...] with means over ``known`` [H, W] pixels within ``radius`` where it is NaN, or ``other``."""
+    """Return an image [H, W, ...] with NaN replaced by means over ``known`` [H, W] pixels nearby, or by ``other``."""
     weight = known.reshape(*known.shape, *[1] * (image.ndim - 2)).astype(np.float64)
     number, total = smoothed(weight, radius), smoothed(np.where(weight > 0.0, image, 0.0), radius)
     # sums of whole numbers that should be 0 are not quite
@@ -43,9 +43,9 @@ def filled(image: np.ndarray, known: np.ndarray, radius: int, other: float) -> n
 
 
 def best_shift(image: np.ndarray, other: np.ndarray) -> tuple[int, int]:
-    """Rows and columns by which ``image`` [H, W] is shifted to look most like ``other`` [H, W], at most by half.
+    """Return rows and columns by which ``image`` [H, W] matches ``other`` [H, W] best, at most half of its size.
 
-    The least mean square over what both show then, by Fourier transforms.
+    The mean square difference over the common part is least, by Fourier transforms.
     """
     size = tuple(2 * n for n in image.shape)
     inside = np.fft.rfft2(np.ones(image.shape), size)
@@ -66,9 +66,9 @@ def best_shift(image: np.ndarray, other: np.ndarray) -> tuple[int, int]:
 
 
 def moved(image: np.ndarray, motion: np.ndarray) -> np.ndarray:
-    """An image [H, W, ...] that shows at each pixel what lay ``motion`` [H, W, 2] columns and rows before it.
+    """Return an image [H, W, ...] whose pixels show what lay ``motion`` [H, W, 2] columns and rows before them.
 
-    Linear between pixels; edges are repeated.
+    It is linear between pixels; edges are repeated.
     """
     places, weights = [], []
     for axis, step in ((0, motion[..., 1]), (1, motion[..., 0])):
@@ -85,7 +85,7 @@ def moved(image: np.ndarray, motion: np.ndarray) -> np.ndarray:
 
 
 def shifted(image: np.ndarray, rows: int, columns: int) -> np.ndarray:
-    """An image [H, W, ...] moved down and to the right, its edges repeated."""
+    """Return an image [H, W, ...] moved down and to the right, edges repeated."""
     down, right = (
         np.clip(np.arange(n) - move, 0, n - 1) for n, move in zip(image.shape[:2], (rows, columns), strict=True)
     )

@@ -1,4 +1,4 @@
-"""Parts of a cell that are decided where the whole is not (docs/dev/design.md, Q8)."""
+"""Decides parts of a cell where the whole cell is not decided (docs/dev/design.md, Q8)."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ from ns_abstract.verify.search_results import FAILURES
 
 @dataclass(frozen=True)
 class PartTuning:
-    """How cells are divided. None of it decides whether a bound holds."""
+    """Preferences on how cells are divided; soundness does not depend on them."""
 
     #: Most equal parts of a cell, and the part of a box that has to be left for it to become one cell.
     parts: int = 64
@@ -40,8 +40,8 @@ class CellPart:
     """A part of a cell, in whole units.
 
     Attributes:
-        verdict: "certified": the property holds at every pose; "falsified": at none; None: it is to be examined.
-        margin: Proven lower bound of the margin of a certified part, proven upper bound of a falsified one's.
+        verdict: "certified": the property holds at every pose; "falsified": at none; None: it has to be examined.
+        margin: Proved lower bound of the margin of a certified part, proved upper bound of a falsified one's.
     """
 
     cell: Cell
@@ -51,13 +51,13 @@ class CellPart:
 
 @dataclass(frozen=True)
 class PartQuestion:
-    """What is asked of the parts of cells.
+    """The property to decide for parts of cells.
 
     Attributes:
-        claim: What is to be proved.
-        model: What bounds it.
-        query: The claim's.
-        refute: Whether parts are looked for in which the property surely fails everywhere.
+        claim: The claim to be proved.
+        model: Bounds the claim's outputs.
+        query: The claim's rows.
+        refute: Whether to search for parts in which the property fails everywhere, too.
     """
 
     claim: Claim
@@ -68,10 +68,10 @@ class PartQuestion:
     def parts(
         self, images: ImageSets, cell: Cell, box: ParameterBox, halves: bool = True, ends: SubBoxEnds | None = None
     ) -> list[CellPart]:
-        """Parts that tile a cell, by what its linear sets ``images`` decide of them (Q8); empty if they decide none.
+        """Return parts that tile a cell, decided by its linear sets ``images`` (Q8); empty if none is decided.
 
-        ``box``: the cell's parameters. ``halves``: whether halves of it are refuted, too, and not all of it alone.
-        ``ends``: what `divided_sets` returns of the cell.
+        ``box``: the cell's parameters. ``halves``: whether halves are refuted, too, not only the whole cell. ``ends``:
+        the sub-box bounds that `divided_sets` returns.
         """
         counts = sub_box_counts(cell, self.model.part_counts(images, _TUNING.parts)) if ends is None else ends.counts
         if not resolved(box, counts):
@@ -88,10 +88,10 @@ class PartQuestion:
         return list(_tiled(cell, (low, high), decided)) if np.any(decided) else []
 
     def bounded(self, scene: FrameImages, grid: CellGrid, cell: Cell) -> list[CellPart]:
-        """`parts` by sets over the cell itself (Q8); its halves where they decide none; empty where it has no sets.
+        """Return `parts` by sets over the cell itself (Q8); its halves where none is decided; empty without sets.
 
-        A part of a cell is bounded without any picture of it: what a search does with a cell takes several times as
-        long as its sets. Small parts are not refuted, each of which would cost a picture.
+        A part is bounded without rendering: examining a cell takes several times as long as its sets. Small parts are
+        not refuted, as each would cost a render.
         """
         check_cancelled()
         box = grid.box_of(cell)
@@ -111,14 +111,14 @@ class PartQuestion:
 
 
 def narrowed(scene: FrameImages, cell: Cell, part: Cell, ends: SubBoxEnds | None) -> FrameImages:
-    """Pictures, for bounds of a ``part`` of a cell alone, by what ``ends`` say of the cell's sub-boxes (Q9)."""
+    """Return the pictures of a ``part`` of a cell, with bounds narrowed by ``ends`` of the cell's sub-boxes (Q9)."""
     if ends is None or not isinstance(scene, DividedImages):
         return scene
     return scene.narrowed(ends, meeting(cell, ends.counts, part))
 
 
 def divided_sets(scene: FrameImages, cell: Cell, box: ParameterBox) -> tuple[PixelSets, SubBoxEnds | None]:
-    """Sets of a cell with the parameters ``box``, and bounds over sub-boxes of whole units where it has some (Q8)."""
+    """Return sets of a cell with parameters ``box``, and bounds over its sub-boxes of whole units, or None (Q8)."""
     if isinstance(scene, DividedImages):
         most = scene.sub_box_counts(box, _TUNING.parts)
         if most is not None and resolved(box, counts := sub_box_counts(cell, most)):
@@ -129,10 +129,10 @@ def divided_sets(scene: FrameImages, cell: Cell, box: ParameterBox) -> tuple[Pix
 def _tiled(
     cell: Cell, margins: tuple[np.ndarray, np.ndarray], decided: tuple[np.ndarray, np.ndarray]
 ) -> Iterator[CellPart]:
-    """Parts that tile a cell, none larger than a half along each parameter that is divided.
+    """Yield parts that tile a cell, at most half of it along each divided parameter.
 
-    ``margins`` and ``decided`` [counts]: lower and upper bounds by equal part, and what is proved by either. Falsified
-    parts cost a picture each, so that none is cut off from what is left.
+    ``margins`` and ``decided`` [counts]: lower and upper bounds by equal part, and which of them prove something.
+    Falsified parts cost a render each, so open parts are not cut for their sake.
     """
     proved, refuted = decided
     counts = np.array(proved.shape)

@@ -1,4 +1,4 @@
-"""A photo as a claim about poses: which pictures may have made it, and which cells of poses cannot (design.md, Q).
+"""A photo as a claim about poses: which pictures may have made it, and which cells cannot (docs/dev/design.md, U).
 
 A picture explains a photo where all but a few of the pixels lie within the noise of the photo's values.
 """
@@ -25,7 +25,7 @@ _FITS = 8
 
 @dataclass(frozen=True)
 class Brightness:
-    """What a camera may do to all values alike (U6): it shows ``gain * value + offset``, clipped to [0, 1].
+    """The set of brightness changes of a camera (U6): it shows ``gain * value + offset``, clipped to [0, 1].
 
     Gains, above 0, and offsets lie between their ends.
     """
@@ -35,13 +35,13 @@ class Brightness:
 
     @property
     def still(self) -> bool:
-        """Whether the camera shows the picture itself."""
+        """Whether the camera shows the picture unchanged."""
         return (*self.gain, *self.offset) == (1.0, 1.0, 0.0, 0.0)
 
     def before(self, low: Float64Array, high: Float64Array) -> tuple[Float64Array, Float64Array]:
-        """Ends of the values that some gain and offset take into [low, high], rounded outward (U6).
+        """Return ends of the values that some gain and offset map into [low, high], rounded outward (U6).
 
-        What is clipped to an end that lies within may have been anything beyond it.
+        A value that is clipped to an end inside may have been anything beyond it.
         """
         ends = []
         for side, sign, offset in ((low, -1.0, self.offset[1]), (high, 1.0, self.offset[0])):
@@ -53,9 +53,9 @@ class Brightness:
         return np.where(low <= 0.0, -np.inf, ends[0]), np.where(high >= 1.0, np.inf, ends[1])
 
     def outside(self, picture: np.ndarray, low: Float64Array, high: Float64Array, counted: np.ndarray) -> np.ndarray:
-        """Which counted pixels of a picture [..., 3] one gain and offset for all of them do not take into [low, high].
+        """Return which counted pixels of a picture [..., 3] one fitted gain and offset do not map into [low, high].
 
-        They are fitted: others may do better.
+        Other gains and offsets may leave fewer.
         """
         middle, values = 0.5 * (low + high)[counted].ravel(), picture[counted].astype(np.float64).ravel()
         room = 0.5 * (high - low)[counted].ravel()
@@ -78,14 +78,14 @@ class Brightness:
 
 @dataclass(frozen=True, eq=False)
 class Photo:
-    """A photo of 8 bits, and what of it a picture may miss.
+    """An 8-bit photo, and how far a picture may differ from it.
 
     Attributes:
         levels: [H, W, 3] uint8.
-        noise: By how much a value of the photo, in [0, 1], may differ from the picture's before it is rounded.
-        outliers: Part of the counted pixels that may show anything.
+        noise: Largest difference of a value, in [0, 1], from the picture's before rounding.
+        outliers: Fraction of the counted pixels that may show anything.
         counted: [H, W] which pixels count.
-        brightness: What the camera may do to all values alike.
+        brightness: The camera's brightness changes.
     """
 
     levels: np.ndarray
@@ -101,25 +101,25 @@ class Photo:
 
     @cached_property
     def shown(self) -> tuple[Float64Array, Float64Array]:
-        """Least and greatest values [H, W, 3] that the camera shows where they explain a pixel (U1)."""
+        """Ends [H, W, 3] of the camera's values that explain a pixel (U1)."""
         value = self.levels.astype(np.float64) / _STEPS
         room = self.noise + (0.5 + STEP) / _STEPS + QUOTIENT + PHOTO_ROOM
         return value - room, value + room
 
     @cached_property
     def ends(self) -> tuple[Float64Array, Float64Array]:
-        """Least and greatest values [H, W, 3] of a picture that explains a pixel, at any brightness (U1, U6)."""
+        """Ends [H, W, 3] of a picture's values that explain a pixel, at any brightness (U1, U6)."""
         return self.shown if self.brightness.still else self.brightness.before(*self.shown)
 
     def outside(self, picture: np.ndarray) -> np.ndarray:
-        """[H, W] which counted pixels of a picture [H, W, 3] do not explain the photo; NaN explains nothing."""
+        """Return [H, W] which counted pixels of a picture [H, W, 3] do not explain the photo; NaN explains nothing."""
         if not self.brightness.still:
             return self.brightness.outside(picture, *self.shown, self.counted)
         low, high = self.ends
         return self.counted & ~((picture >= low) & (picture <= high)).all(axis=-1)
 
     def tiled(self, side: int) -> TiledPhoto:
-        """The photo in tiles of ``side`` pixels."""
+        """Return the photo in tiles of ``side`` pixels."""
         low, high = self.ends
         ends = None if self.brightness.still else tuple(in_tiles(end, side) for end in self.shown)
         parts = in_tiles(low, side), in_tiles(high, side), in_tiles(self.counted, side)
@@ -128,13 +128,13 @@ class Photo:
 
 @dataclass(frozen=True, eq=False)
 class TiledPhoto:
-    """A photo in tiles, as bounds are.
+    """A photo in tiles, in the layout of bounds.
 
     Attributes:
-        low, high: [T, side, side, 3] values of a picture that explains a pixel.
+        low, high: [T, side, side, 3] ends of values that explain a pixel.
         counted: [T, side, side] which pixels count; false beyond the photo's edges.
-        allowed: Pixels of the whole photo that may show anything.
-        shown: `Photo.shown` in tiles, where that is anything.
+        allowed: Number of the photo's pixels that may show anything.
+        shown: `Photo.shown` in tiles, if brightness may change.
     """
 
     low: Float64Array
@@ -146,7 +146,7 @@ class TiledPhoto:
 
     @cached_property
     def differences(self) -> tuple[Float64Array, Float64Array]:
-        """Least and greatest `CHANNEL_DIFFERENCES` of a picture that explains a pixel, before it is clamped (U10)."""
+        """Ends of the `CHANNEL_DIFFERENCES` of a picture that explain a pixel, before it is clamped (U10)."""
         # what shows an end of [0, 1] may have been anything beyond it
         low, high = np.where(self.low <= 0.0, -np.inf, self.low), np.where(self.high >= 1.0, np.inf, self.high)
         least = low[..., FIRST_CHANNELS] - high[..., SECOND_CHANNELS]
@@ -154,28 +154,28 @@ class TiledPhoto:
         return np.nextafter(least, -np.inf), np.nextafter(most, np.inf)
 
     def chosen(self, numbers: Sequence[int]) -> np.ndarray:
-        """[T, side, side] the pixels with these ``numbers``, in the order of ``counted`` flattened."""
+        """Return [T, side, side] the pixels with these ``numbers``, in the order of ``counted`` flattened."""
         pixels = np.zeros(self.counted.shape, bool)
         pixels.reshape(-1)[list(numbers)] = True
         return pixels
 
     def outside(self, picture: np.ndarray) -> np.ndarray:
-        """[T, side, side] which counted pixels of a picture in tiles do not explain the photo."""
+        """Return [T, side, side] which counted pixels of a picture in tiles do not explain the photo."""
         if self.shown is not None:
             return self.brightness.outside(picture, self.shown[0], self.shown[1], self.counted)
         return self.counted & ~((picture >= self.low) & (picture <= self.high)).all(axis=-1)
 
     def beyond(self, lower: np.ndarray, upper: np.ndarray, tiles: np.ndarray) -> np.ndarray:
-        """[t, side, side] which counted pixels of ``tiles`` [t] no picture between the bounds explains (U2).
+        """Return [t, side, side] which counted pixels of ``tiles`` [t] no picture between the bounds explains (U2).
 
-        The bounds [t, side, side, 3] are of all pictures of a cell; NaN excludes nothing.
+        The bounds [t, side, side, 3] hold for all pictures of a cell; NaN excludes nothing.
         """
         # bounds that cross bound nothing
         sane = (lower <= upper).all(axis=-1)
         return sane & self.counted[tiles] & ((lower > self.high[tiles]) | (upper < self.low[tiles])).any(axis=-1)
 
     def _explaining(self, pixels: np.ndarray, differences: np.ndarray | None) -> tuple[np.ndarray, np.ndarray]:
-        """[n, 3], [n, 3] the least and most that explain the ``n`` ``pixels`` [T, side, side]."""
+        """Return ends [n, 3], [n, 3] of values that explain the ``n`` ``pixels`` [T, side, side]."""
         low, high = self.low[pixels], self.high[pixels]
         if differences is None or not differences.any():
             return low, high
@@ -184,35 +184,36 @@ class TiledPhoto:
         return low, high
 
     def goals(self, pixels: np.ndarray, differences: np.ndarray) -> np.ndarray:
-        """[n, 6] what lower, then upper bounds of the ``n`` ``pixels`` [T, side, side] exclude beyond (U5, U10)."""
+        """Return [n, 6] the values beyond which lower, then upper bounds of ``n`` ``pixels`` exclude (U5, U10)."""
         return np.concatenate(self._explaining(pixels, differences)[::-1], axis=-1)
 
     def excluding(
         self, lower: np.ndarray, upper: np.ndarray, pixels: np.ndarray, differences: np.ndarray | None = None
     ) -> np.ndarray:
-        """[n, k] which of the ``n`` ``pixels`` [T, side, side] exclude which of ``k`` sub-boxes (U2, U5, U10).
+        """Return [n, k] which of the ``n`` ``pixels`` [T, side, side] exclude which of ``k`` sub-boxes (U2, U5, U10).
 
-        Their bounds [n, 3, k], of channels or, where ``differences`` [n] says so, of `CHANNEL_DIFFERENCES`, lie beyond
-        what explains them; NaN, crossed bounds and pixels that do not count exclude nothing.
+        A pixel excludes a sub-box if its bounds [n, 3, k] lie beyond the values that explain it. They are of channels,
+        or, where ``differences`` [n], of `CHANNEL_DIFFERENCES`. NaN, crossed bounds and uncounted pixels exclude
+        nothing.
         """
         low, high = (end[:, :, None] for end in self._explaining(pixels, differences))
         beyond = (lower <= upper).all(axis=1) & ((lower > high) | (upper < low)).any(axis=1)
         return beyond & self.counted[pixels][:, None]
 
     def explained(self, lower: np.ndarray, upper: np.ndarray, tiles: np.ndarray) -> int:
-        """How many counted pixels of ``tiles`` every picture between the bounds explains."""
+        """Return how many counted pixels of ``tiles`` every picture between the bounds explains."""
         inside = (lower >= self.low[tiles]) & (upper <= self.high[tiles]) & (lower <= upper)
         return int((self.counted[tiles] & inside.all(axis=-1)).sum())
 
     def reach(self, linear: LinearSets, beyond: np.ndarray, tiles: np.ndarray) -> tuple[Float64Array, Float64Array]:
-        """Ends [d], [d] in [-1, 1] of the scaled parameters outside of which no pose explains the photo (U3).
+        """Return ends [d], [d] in [-1, 1] of the scaled parameters outside of which no pose explains the photo (U3).
 
-        Along each parameter, a pixel rules out all that lies beyond its reach, wherever the others are. What more
-        pixels rule out than may show anything is ruled out. The ends cross where the cell is.
+        Along each parameter, a pixel excludes everything beyond its own end, wherever the other parameters are. Values
+        that more pixels exclude than may be outliers are excluded. The ends cross if the whole cell is.
 
         Args:
             linear: Linear bounds of ``tiles`` over a cell.
-            beyond: [t, side, side] pixels that nothing in the cell explains.
+            beyond: [t, side, side] pixels that no picture in the cell explains.
             tiles: [t] numbers.
         """
         counted = self.counted[tiles]

@@ -1,7 +1,7 @@
-"""Numbers that are read off a picture, its depths or its blending weights, and their bounds (docs/dev/design.md, Q4).
+"""Numbers measured in a picture, its depths or its blending weights, and their bounds (docs/dev/design.md, Q4).
 
-A measure is a mean or an order statistic of the pixels of a region: it grows with every pixel, so that bounds of the
-pixels bound it, over a cell part by part, where the pixels' linear bounds hold.
+A measure is a mean or an order statistic of the pixels of a region. It grows with every pixel, so bounds of the pixels
+bound it, over a cell or over each part of it.
 """
 
 from __future__ import annotations
@@ -38,7 +38,7 @@ class Region:
     white: np.ndarray | None = field(default=None, compare=False, repr=False)
 
     def pixels(self, height: int, width: int) -> np.ndarray:
-        """[H, W] bool."""
+        """Return the region as [H, W] bool."""
         chosen = np.ones((height, width), bool)
         if self.white is not None:
             chosen = self.white.copy()
@@ -73,14 +73,14 @@ class Region:
 
 @dataclass(frozen=True, eq=False)
 class Measure:
-    """A number of a picture of known size.
+    """A number measured in a picture of known size.
 
     Attributes:
-        plane: What it is read off.
-        channels: [c] how much each channel of the plane counts, not negative.
-        rank: The so many-th largest of the region's pixels, or smallest where ``least``; None: their mean.
-        pixels: [n] places of the region's pixels, row by row.
-        minus: [k] places of a second region, the same statistic of which is subtracted; None: nothing is.
+        plane: The colours, depths or weights that are measured.
+        channels: [c] non-negative weights of the plane's channels.
+        rank: Takes the rank-th largest of the region's pixels, or smallest where ``least``; None: their mean.
+        pixels: [n] flat positions of the region's pixels.
+        minus: [k] flat positions of a second region, whose statistic is subtracted; None: there is none.
         cap: Pixels above it count as it.
     """
 
@@ -93,7 +93,7 @@ class Measure:
     cap: float = math.inf
 
     def value(self, planes: torch.Tensor, first: int) -> torch.Tensor:
-        """[B] values of pictures [B, H, W, C] whose channels ``first`` on are the plane's; differentiable."""
+        """Return values [B] of pictures [B, H, W, C] whose channels ``first`` on are the plane's; differentiable."""
         flat = planes.flatten(1, 2)[..., first : first + len(self.channels)]
         single = (flat * torch.tensor(self.channels, dtype=flat.dtype)).sum(dim=-1).clamp(max=self.cap)
         value = self._statistic(single[:, self.pixels])
@@ -105,7 +105,7 @@ class Measure:
         return torch.topk(pixels, self.rank, dim=1, largest=not self.least).values[:, -1]
 
     def bounds(self, planes: PlaneSets, first: int, parts: CellParts) -> tuple[np.ndarray, np.ndarray]:
-        """[s] lower and upper bounds of the value over each part of the cell."""
+        """Return lower and upper bounds [s] of the value over each part of the cell."""
         low, high = self._one(planes, first, parts, self.pixels)
         if self.minus is not None:
             taken = self._one(planes, first, parts, self.minus)
@@ -119,7 +119,7 @@ class Measure:
     def _one(
         self, planes: PlaneSets, first: int, parts: CellParts, pixels: np.ndarray
     ) -> tuple[np.ndarray, np.ndarray]:
-        """[s] bounds of the statistic of some pixels over each part."""
+        """Return bounds [s] of the statistic of some pixels over each part."""
         low, high = (np.minimum(side, self.cap) for side in planes.over(parts, pixels, first, np.array(self.channels)))
         if self.rank is None:
             rounding = len(pixels) * OWN_MARGIN * np.maximum(np.abs(low).max(axis=1), np.abs(high).max(axis=1))
@@ -134,7 +134,7 @@ class Measure:
     def _mean(
         self, planes: PlaneSets, first: int, parts: CellParts, regions: list[tuple[np.ndarray, float]]
     ) -> tuple[np.ndarray, np.ndarray]:
-        """[s] bounds of a signed sum of means by linear bounds alone."""
+        """Return bounds [s] of a signed sum of means by linear bounds alone."""
         channels, ends = np.array(self.channels), []
         for sign in (1.0, -1.0):
             slope, value, size, count = np.zeros(parts.dimensions), 0.0, 0.0, 0
@@ -153,7 +153,7 @@ class Measure:
 
 
 def ranked(values: np.ndarray, place: int) -> np.ndarray:
-    """Return [s] the entry number ``place`` of each row of ``values`` [s, n], counted from the least, from 0 on."""
+    """Return [s] the entry of rank ``place`` (0: the least) of each row of ``values`` [s, n]."""
     varies = (values != values[0]).any(axis=0)
     count = int(varies.sum())
     # of what is the same in all rows, only as many can be meant as there are others
@@ -164,7 +164,7 @@ def ranked(values: np.ndarray, place: int) -> np.ndarray:
 
 
 def shared_counts(effects: np.ndarray, most_parts: int) -> np.ndarray:
-    """Return [d] numbers of parts, powers of two, ``most_parts`` together or fewer; larger ``effects`` get more."""
+    """Return numbers [d] of parts, powers of two, at most ``most_parts`` together; larger ``effects`` get more."""
     counts = np.ones(len(effects), np.int64)
     while effects.size and np.max(effects / counts) > 0.0 and 2 * counts.prod() <= most_parts:
         counts[int(np.argmax(effects / counts))] *= 2
@@ -173,7 +173,7 @@ def shared_counts(effects: np.ndarray, most_parts: int) -> np.ndarray:
 
 @lru_cache(maxsize=64)
 def _equal_parts(counts: tuple[int, ...]) -> tuple[np.ndarray, np.ndarray]:
-    """Middles and half widths of `CellParts.equal` that do not overlap."""
+    """Return middles and half widths of `CellParts.equal` without overlap."""
     middles, halves = np.zeros((1, 0)), np.zeros((1, 0))
     for count in counts:
         # powers of two: these are exact
@@ -197,20 +197,20 @@ class CellParts:
 
     @classmethod
     def equal(cls, counts: np.ndarray, overlap: float = 0.0) -> CellParts:
-        """``counts`` [d] parts along the parameters, powers of two, that reach by ``overlap`` beyond their ends."""
+        """Return ``counts`` [d] parts along the parameters, powers of two, each longer by ``overlap`` at its ends."""
         middles, halves = _equal_parts(tuple(counts.tolist()))
         return cls(middles, halves + overlap)
 
 
 @dataclass(frozen=True)
 class SubBoxEnds:
-    """Bounds of some pixels over each of equal sub-boxes of one cell, beside its linear sets (Q8).
+    """Bounds of some pixels over equal sub-boxes of one cell, in addition to its linear sets (Q8).
 
     Attributes:
-        counts: [d] numbers of sub-boxes along the parameters, powers of two. Each reaches by `SUB_BOX_OVERLAP` of the
+        counts: [d] numbers of sub-boxes along the parameters, powers of two. Each extends by `SUB_BOX_OVERLAP` of the
             cell's half-widths beyond its ends.
-        pixels: [n] places in the picture, row by row, each once.
-        lower, upper: [s, n, C] of planes, sub-boxes numbered like entries of an array of shape ``counts``.
+        pixels: [n] flat positions in the picture, each once.
+        lower, upper: [s, n, C] of planes; sub-boxes in the order of an array of shape ``counts``.
     """
 
     counts: np.ndarray
@@ -223,7 +223,7 @@ class SubBoxEnds:
 class PlaneSets:
     """Linear sets of all planes of one cell's pictures, A_lower [n, C, d], b_lower [n, C], A_upper, b_upper.
 
-    ``ends``: bounds of some pixels over the parts that `over` is asked for; None: the sets are all that is known.
+    ``ends``: bounds of some pixels over the parts that are passed to `over`; None: there are only the sets.
     """
 
     linear: tuple[np.ndarray, ...]
@@ -234,9 +234,9 @@ class PlaneSets:
     def over(
         self, parts: CellParts, pixels: np.ndarray, first: int, channels: np.ndarray
     ) -> tuple[np.ndarray, np.ndarray]:
-        """[s, k] lower and upper bounds of weighted channels, ``first`` on, of ``pixels`` [k] over each part.
+        """Return bounds [s, k] of weighted channels, ``first`` on, of ``pixels`` [k] over each part.
 
-        The pixels are places in the picture, in order.
+        Pixels are flat positions in the picture, ascending.
         """
         cut = slice(first, first + len(channels))
         ends = []
@@ -265,7 +265,7 @@ class PlaneSets:
 
 
 def planes_of(images: ImageSets, channels: int) -> Iterator[PlaneSets]:
-    """Yield the planes of each cell, whose pictures have so many channels."""
+    """Yield the planes of each cell, whose pictures have ``channels`` channels."""
     arrays = (images.a_lower, images.b_lower, images.a_upper, images.b_upper, images.lower, images.upper)
     for a_lower, b_lower, a_upper, b_upper, lower, upper in zip(*arrays, strict=True):
         shape = len(lower) // channels, channels, a_lower.shape[-1]

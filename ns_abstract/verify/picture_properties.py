@@ -1,6 +1,6 @@
 """Properties of the picture itself, without a network: ``visible``, ``clear``, ``picture``, ``all`` and ``any``.
 
-A property is a tree whose leaves say that a measure of the picture lies within limits; its margin is the least or the
+A property is a tree whose leaves state that a measure of the picture lies within limits; its margin is the least or the
 greatest of theirs (docs/dev/design.md, Q4).
 """
 
@@ -62,9 +62,9 @@ class Leaf:
 
     Attributes:
         sentence: In words, as the end of "on every image ...".
-        plane, statistic, region, minus: What is measured; see `Measure`.
-        channels: How much each channel of the plane counts.
-        pixels: The so many-th largest pixel, for the statistic "rank": a number, or a part of the region.
+        plane, statistic, region, minus: See `Measure`.
+        channels: Weights of the plane's channels.
+        pixels: For the statistic "rank": takes the pixels-th largest pixel; a number, or a fraction of the region.
     """
 
     sentence: str
@@ -79,7 +79,7 @@ class Leaf:
     cap: float = math.inf
 
     def measure(self, height: int, width: int) -> Measure:
-        """The measure of pictures of this size; InputError if a region does not lie in them or has too few pixels."""
+        """Return the measure for pictures of this size; InputError if a region does not fit or has too few pixels."""
         places = np.flatnonzero(self.region.pixels(height, width))
         minus = None if self.minus is None else np.flatnonzero(self.minus.pixels(height, width))
         rank: int | None = 1
@@ -96,7 +96,7 @@ class Leaf:
 
 @dataclass(frozen=True)
 class Combined:
-    """The statement that ``all`` or any of some statements hold."""
+    """The statement that all or any of some statements hold."""
 
     all: bool
     parts: tuple[Statement, ...]
@@ -122,7 +122,7 @@ def _sentence(statement: Statement, inner: bool = False) -> str:
 
 
 def _joined(statement: Statement, margins: Iterator[Any], least: Callable[..., Any], most: Callable[..., Any]) -> Any:
-    """The margin of a statement, of those of its leaves in order."""
+    """Return the margin of a statement from the margins of its leaves, in order."""
     if isinstance(statement, Leaf):
         return next(margins)
     parts = [_joined(part, margins, least, most) for part in statement.parts]
@@ -134,7 +134,7 @@ def _joined(statement: Statement, margins: Iterator[Any], least: Callable[..., A
 
 @dataclass(frozen=True, eq=False)
 class PictureClaim(Claim):
-    """A statement about measures; "outputs" are their values, in the order of the leaves."""
+    """A statement about measures as a claim; its "outputs" are the leaves' values, in order."""
 
     statement: Statement
     limits: tuple[tuple[float, float], ...]
@@ -171,7 +171,7 @@ class PictureClaim(Claim):
         return _joined(self.statement, iter(upper), np.minimum, np.maximum).max(axis=1)
 
     def _ends(self, bounds: OutputBounds, boxes: Sequence[ParameterBox]) -> Iterator[tuple[np.ndarray, np.ndarray]]:
-        """By leaf, lower bounds [m, parts] of its value and of the negative, over parts of the cells."""
+        """Yield by leaf lower bounds [m, parts] of its value and of the negative, over parts of the cells."""
         lower = bounds.lower.reshape(len(boxes), -1, 2, len(self.limits))
         for k in range(len(self.limits)):
             # what is not known is as bad as can be, whatever it is combined with
@@ -180,7 +180,7 @@ class PictureClaim(Claim):
 
     @staticmethod
     def _rounding(margin: np.ndarray) -> np.ndarray:
-        """Of a margin's own sums."""
+        """Return an upper bound of the rounding of a margin's own sums."""
         return OWN_MARGIN * (1.0 + np.abs(np.where(np.isfinite(margin), margin, 0.0)))
 
 
@@ -200,21 +200,21 @@ class PictureProperty(Property):
 
     @property
     def planes(self) -> tuple[Plane, ...]:
-        """What is read, each once."""
+        """The planes that the measures need, each once."""
         return tuple(dict.fromkeys(leaf.plane for leaf in leaves(self.statement)))
 
     def bind(self, pose_set: PoseBox, nominal: Callable[[], np.ndarray]) -> PictureClaim:
         return PictureClaim(self.statement, tuple((leaf.low, leaf.high) for leaf in leaves(self.statement)))
 
     def model(self, height: int, width: int) -> MeasureModel:
-        """The measures in the place of a network, of pictures of this size whose colours come first."""
+        """Return the measures as a model, in place of a network; pictures of this size have colours first."""
         others = [plane for plane in self.planes if plane != "colors"]
         measures = self.measures(height, width)
         places = [0 if m.plane == "colors" else COLORS + others.index(m.plane) for m in measures]
         return MeasureModel(measures, places, COLORS + len(others))
 
     def limited(self, height: int, width: int) -> tuple[LimitedMeasure, ...]:
-        """The measures of pictures of this size with their limits, by leaf; InputError as `measures`."""
+        """Return the measures for pictures of this size with their limits, by leaf; InputError as `measures`."""
         model = self.model(height, width)
         by_leaf = zip(model.measures, model.places, leaves(self.statement), strict=True)
         return tuple(
@@ -223,7 +223,7 @@ class PictureProperty(Property):
         )
 
     def measures(self, height: int, width: int) -> tuple[Measure, ...]:
-        """The measures of pictures of this size, by leaf; InputError if a region does not lie in them."""
+        """Return the measures for pictures of this size, by leaf; InputError if a region does not fit."""
         return tuple(leaf.measure(height, width) for leaf in leaves(self.statement))
 
 
@@ -241,17 +241,17 @@ class MeasureModel:
         self.measures, self.places, self.channels = tuple(measures), tuple(places), channels
 
     def outputs(self, images: np.ndarray) -> np.ndarray:
-        """[B, leaves] values of pictures [B, H, W, C]."""
+        """Return values [B, leaves] of pictures [B, H, W, C]."""
         with torch.no_grad():
             return self.differentiable(torch.from_numpy(np.asarray(images, np.float64))).numpy()
 
     def differentiable(self, images: torch.Tensor) -> torch.Tensor:
-        """[B, leaves] values of pictures [B, H, W, C]."""
+        """Return values [B, leaves] of pictures [B, H, W, C]."""
         pairs = zip(self.measures, self.places, strict=True)
         return torch.stack([measure.value(images, first) for measure, first in pairs], dim=1)
 
     def input_sets(self, linear: tuple[np.ndarray, ...], lower: np.ndarray, upper: np.ndarray) -> ImageSets:
-        """The sets as they are, the numbers of a picture in a row."""
+        """Return the sets with each picture's numbers flattened."""
         m, d = len(lower), linear[0].shape[-1]
         slopes, rest = (linear[0], linear[2]), (linear[1], linear[3], lower, upper)
         a_lower, a_upper = (np.asarray(part).reshape(m, lower[0].size, d) for part in slopes)
@@ -259,7 +259,7 @@ class MeasureModel:
         return ImageSets(a_lower, b_lower, a_upper, b_upper, low, high)
 
     def bound(self, images: ImageSets, query: Query) -> OutputBounds:
-        """Lower bounds of values and of their negatives over parts of cells, a row for each [parts, 2, leaves]."""
+        """Return lower bounds of values and of their negatives over parts of cells, as rows [parts, 2, leaves]."""
         rows = [
             self._over(planes, CellParts.equal(self._counts(planes, _PARTS)))
             for planes in planes_of(images, self.channels)
@@ -270,14 +270,14 @@ class MeasureModel:
         return OutputBounds(lower, np.zeros((*lower.shape, 1)), lower)
 
     def part_counts(self, images: ImageSets, most_parts: int) -> np.ndarray:
-        """[d] numbers of parts of one cell, at most ``most_parts`` together, more where its pictures change more."""
+        """Return numbers [d] of parts of one cell, up to ``most_parts`` together, more where its pictures vary."""
         (planes,) = planes_of(images, self.channels)
         return self._counts(planes, most_parts)
 
     def bound_parts(self, images: ImageSets, counts: np.ndarray, ends: SubBoxEnds | None = None) -> OutputBounds:
-        """`bound` of equal parts of one cell, ``counts`` [d] along its parameters, each as if it were a cell (Q8).
+        """Return `bound` of equal parts of one cell, ``counts`` [d] along its parameters, each as a cell (Q8).
 
-        They reach by `SUB_BOX_OVERLAP` of the cell's half-widths beyond their ends. ``ends`` are over the same parts.
+        Parts extend by `SUB_BOX_OVERLAP` of the cell's half-widths beyond their ends, as those of ``ends`` do.
         """
         assert ends is None or np.array_equal(ends.counts, counts)
         (planes,) = planes_of(images, self.channels)
@@ -286,19 +286,19 @@ class MeasureModel:
         return OutputBounds(lower, np.zeros((*lower.shape, 1)), lower)
 
     def _counts(self, planes: PlaneSets, most_parts: int) -> np.ndarray:
-        """[d] numbers of parts of a cell, ``most_parts`` together or fewer where there are many pixels."""
+        """Return numbers [d] of parts of a cell, at most ``most_parts`` together, fewer where there are many pixels."""
         read = np.unique(np.concatenate([m.pixels for m in self.measures]))
         effects = np.abs(planes.linear[0][read].astype(np.float64)).sum(axis=(0, 1))
         return shared_counts(effects, max(1, min(most_parts, _NUMBERS // read.size)))
 
     def _over(self, planes: PlaneSets, parts: CellParts) -> np.ndarray:
-        """[parts, 2, leaves] lower bounds of values and of their negatives."""
+        """Return lower bounds [parts, 2, leaves] of values and of their negatives."""
         ends = [m.bounds(planes, first, parts) for m, first in zip(self.measures, self.places, strict=True)]
         low, high = (np.stack(side, axis=1) for side in zip(*ends, strict=True))
         return np.stack([low, -high], axis=1)
 
     def branch(self, images: ImageSets, query: Query, groups: Sequence[Sequence[int]], most_branches: int) -> float:
-        """Nothing: there are no activations."""
+        """Return no bound: a measure has no activations to branch on."""
         return -math.inf
 
 
@@ -311,7 +311,7 @@ _PLACE = ("region", "mask")
 
 
 class _PropertyObject(NamedTuple):
-    """An object of the file, the name of its place in it for errors, the folder of files that it names."""
+    """An object of the file, with its place for error messages, and the folder of the files that it names."""
 
     root: dict[str, Any]
     prefix: str
@@ -319,7 +319,7 @@ class _PropertyObject(NamedTuple):
     dataset_scale: float | None
 
     def number(self, key: str, low: float, high: float, otherwise: float | None = None) -> float:
-        """A number between two others, the ends included."""
+        """Return the number under a key, in [low, high]; ``otherwise`` if it is absent."""
         value = self.root.get(key, otherwise)
         if value is None:
             raise fail(f"{self.prefix}{key}", "missing", f"write a number from {low:g} to {high:g}")
@@ -328,14 +328,14 @@ class _PropertyObject(NamedTuple):
         return float(value)
 
     def choice(self, key: str, values: Sequence[str]) -> str:
-        """One of some names, the first if there is none."""
+        """Return the name under a key, one of ``values``; the first if it is absent."""
         value = self.root.get(key, values[0])
         if value not in values or not isinstance(value, str):
             raise unusable(value, field=f"{self.prefix}{key}", fix=f"write one of {', '.join(values)}")
         return value
 
     def region(self, key: str = "region") -> Region:
-        """The box under a key, or the mask beside the key region; all of the picture if there is neither."""
+        """Return the box under a key, or the mask beside the key region; the whole picture if both are absent."""
         name = f"{self.prefix}{key}"
         box, mask = self.root.get(key), self.root.get("mask") if key == "region" else None
         if box is not None and mask is not None:
@@ -357,7 +357,7 @@ class _PropertyObject(NamedTuple):
 
 
 def _below(number: float) -> float:
-    """The number before ``number``: what is above it is ``number`` or more."""
+    """Return the float before ``number``: everything above it is ``number`` or more."""
     return float(np.nextafter(number, -np.inf))
 
 
@@ -440,7 +440,7 @@ PICTURE_TYPES = {
 
 
 def is_of_picture(root: Any) -> bool:
-    """Whether a parsed PROP.json states a property of the picture, for which there is no network."""
+    """Return whether a parsed PROP.json states a property of the picture, which needs no network."""
     return isinstance(root, dict) and ("all" in root or "any" in root or root.get("type") in tuple(PICTURE_TYPES))
 
 
@@ -462,7 +462,7 @@ def parse_picture_property(root: dict[str, Any], folder: Path, dataset_scale: fl
 def parse_statement(
     root: Any, folder: Path, dataset_scale: float | None, common: tuple[str, ...] = (), prefix: str = "", depth: int = 0
 ) -> Statement:
-    """Return the statement of an object; ``prefix`` is its place, ``common`` are keys that may stand beside it."""
+    """Return the statement of a JSON object at ``prefix``; ``common`` are keys that are allowed beside it."""
     if not isinstance(root, dict):
         raise unusable(root, field=prefix.rstrip(".") or "type", fix='write an object {"type": ...}')
     kinds = [name for name in ("all", "any") if name in root]

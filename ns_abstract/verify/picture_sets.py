@@ -15,7 +15,7 @@ from ns_abstract.refine.protocol import LinearSets
 
 @dataclass(frozen=True)
 class HullTuning:
-    """Slopes of a hull. None of them decides whether a bound holds."""
+    """Preferences on the slopes of a hull; soundness does not depend on them."""
 
     #: Parts are taken to be no narrower where their slopes are put together, and no nearer to each other.
     least_share: float = 1e-12
@@ -25,14 +25,14 @@ _TUNING = HullTuning()
 
 
 def sane(linear: Sequence[np.ndarray], lower: np.ndarray, upper: np.ndarray) -> bool:
-    """Whether linear sets and bounds are all finite, and the bounds do not cross."""
+    """Return whether linear sets and bounds are all finite, and the bounds do not cross."""
     return all(np.isfinite(v).all() for v in (*linear, lower, upper)) and bool((lower <= upper).all())
 
 
 def flatter_where_better(
     slopes: tuple[np.ndarray, np.ndarray], offsets: tuple[np.ndarray, np.ndarray], least: np.ndarray, most: np.ndarray
 ) -> tuple[LinearSets, np.ndarray, np.ndarray]:
-    """Return linear sets and bounds, rounded outward; a bound is taken for a plane where it is better in the middle."""
+    """Return linear sets and bounds, rounded outward; a plane is replaced by a bound that is tighter in the middle."""
     # comparisons that a NaN fails keep it, so that it is noticed
     flat = least > offsets[0], most < offsets[1]
     b_lower, b_upper = outward(np.where(flat[0], least, offsets[0]), np.where(flat[1], most, offsets[1]))
@@ -51,7 +51,7 @@ class PictureSets:
 
     @property
     def sane(self) -> bool:
-        """Whether all is finite, and the bounds do not cross."""
+        """Whether all numbers are finite, and the bounds do not cross."""
         return sane(self.linear, self.lower, self.upper)
 
     @property

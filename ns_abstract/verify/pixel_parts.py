@@ -1,4 +1,4 @@
-"""Numbers of pixels that are stated as a part of all (docs/dev/design.md, U2, Q4)."""
+"""Numbers of pixels that are stated as a fraction of all (docs/dev/design.md, U2, Q4)."""
 
 from __future__ import annotations
 

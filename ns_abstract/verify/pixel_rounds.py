@@ -1,7 +1,7 @@
-"""Pixels of a wide cell are bounded in rounds, the most telling and cheapest first (docs/dev/design.md, U8).
+"""Bounds the pixels of a wide cell in rounds, the most telling and cheapest first (docs/dev/design.md, U8).
 
 A cell, or one of its sub-boxes, is excluded as soon as the pixels bounded so far exclude it. So most cells are decided
-by a small part of the photo's pixels: flat places, whose bounds hardly widen with the cell's image motion.
+by a small fraction of the photo's pixels: flat areas, whose bounds hardly widen with the cell's image motion.
 """
 
 from __future__ import annotations
@@ -17,15 +17,15 @@ from ns_abstract.verify.photo import TiledPhoto
 
 @dataclass(frozen=True)
 class RoundTuning:
-    """Preferences about rounds. None of them decides whether an excluded cell holds no pose of the photo.
+    """Preferences about rounds; soundness of excluding a cell does not depend on them.
 
     Attributes:
-        first: Pixels of the first round: so many times those that exclude a cell.
-        spare: Pixels of a later round: so many times those that are expected to decide it.
-        hopeless: Part of the missing pixels that has to be expected of the remaining ones for another round.
-        few: Part of the sub-boxes of which no more are left when rounds end: a narrower cell holds them.
-        least_missing: Part of the needed pixels that a later round looks for at least.
-        least_rate: Part of the expected pixels that is taken to exclude at least.
+        first: Pixels of the first round, as a multiple of those that exclude a cell.
+        spare: Pixels of a later round, as a multiple of those that are expected to decide the cell.
+        hopeless: Fraction of the missing pixels that the remaining ones must be expected to give for another round.
+        few: Rounds end when only this fraction of the sub-boxes remains: a narrower cell contains them.
+        least_missing: Least fraction of the needed pixels that a later round looks for.
+        least_rate: Least fraction of the expected pixels that is assumed to exclude.
     """
 
     first: float = 1.35
@@ -37,16 +37,16 @@ class RoundTuning:
 
 
 class PixelRounds:
-    """Counts for each sub-box of a cell the pixels that exclude it, while these are bounded a part at a time (U8).
+    """Counts for each sub-box of a cell the pixels that exclude it, while these are bounded round by round (U8).
 
     Args:
-        inherited: [T, side, side] counted pixels that exclude the whole cell by bounds over a larger one (U9); they are
-            not bounded again. None: there are none.
+        inherited: [T, side, side] counted pixels that exclude the whole cell by bounds over an enclosing one (U9); they
+            are not bounded again. None: there are none.
 
     Attributes:
-        bounded: [T, side, side] pixels whose bounds were counted, and those inherited.
+        bounded: [T, side, side] pixels that were counted, and those inherited.
         numbers: [k] pixels so far that exclude each sub-box.
-        expected: Pixels that would exclude what is left if all were bounded, as a part of those that are needed.
+        expected: Expected number of excluding pixels if all were bounded, as a multiple of the needed ones.
     """
 
     def __init__(
@@ -63,15 +63,15 @@ class PixelRounds:
 
     @property
     def left(self) -> np.ndarray:
-        """[k] which sub-boxes are not excluded: no more pixels exclude them than are outliers of the whole photo."""
+        """Which sub-boxes [k] are not excluded: the pixels that exclude them are no more than the photo's outliers."""
         return self.numbers <= self.photo.allowed
 
     def following(self, order: np.ndarray, shares: Float64Array) -> np.ndarray | None:
-        """[T, side, side] pixels of the next round; None: few sub-boxes are left, or more pixels hardly help.
+        """Return the pixels [T, side, side] of the next round; None: few sub-boxes remain, or more pixels hardly help.
 
         Args:
-            order: [n] numbers of pixels, in the order of `TiledPhoto.counted` flattened, the first one first.
-            shares: [n] part of what is left that each is likely to exclude.
+            order: [n] numbers of pixels, best first, in the order of `TiledPhoto.counted` flattened.
+            shares: [n] fraction of the remaining sub-boxes that each is likely to exclude.
         """
         left, needed = self.left, self.photo.allowed + 1
         fresh = ~self.bounded.reshape(-1)[order]
@@ -97,15 +97,15 @@ class PixelRounds:
 
     @property
     def rest(self) -> np.ndarray:
-        """[T, side, side] all counted pixels that were not bounded."""
+        """Return all counted pixels [T, side, side] that were not bounded."""
         return self.photo.counted & ~self.bounded
 
     def count(self, lower: np.ndarray, upper: np.ndarray, pixels: np.ndarray) -> None:
-        """`take` the ``n`` ``pixels`` [T, side, side] with bounds [n, 3, k] of the pictures of each sub-box."""
+        """Count ``n`` ``pixels`` [T, side, side] by their bounds [n, 3, k] over each sub-box; see `take`."""
         self.take(self.photo.excluding(lower, upper, pixels), pixels)
 
     def take(self, excluding: np.ndarray, pixels: np.ndarray) -> None:
-        """Count which of the ``n`` ``pixels`` [T, side, side] exclude which sub-boxes [n, k], each pixel once."""
+        """Count which of ``n`` ``pixels`` [T, side, side] exclude which sub-boxes [n, k], each pixel once."""
         fresh = (pixels & ~self.bounded)[pixels]
         excluding = excluding[fresh]
         more = excluding.sum(axis=0)
@@ -120,7 +120,7 @@ class PixelRounds:
             self._rate = max(found / float(self._shares[last].sum()), self.tuning.least_rate)
 
     def excluded(self, sub_boxes: np.ndarray) -> np.ndarray:
-        """[T, side, side] the pixels so far that exclude each of some ``sub_boxes`` [k], of which there is one (U9)."""
+        """Return the pixels [T, side, side] so far that exclude every one of some ``sub_boxes`` [k] (U9)."""
         pixels = self.inherited.copy()
         for numbers, excluding in self._excluding:
             pixels.reshape(-1)[numbers[excluding[:, sub_boxes].all(axis=1)]] = True
@@ -128,10 +128,10 @@ class PixelRounds:
 
 
 class BoundedPixels:
-    """Linear bounds of a cell's pixels, as far as they were bounded; other pixels are NaN and exclude nothing (U8).
+    """Linear bounds of the bounded pixels of a cell; other pixels are NaN and exclude nothing (U8).
 
     Attributes:
-        outliers: [T, side, side] counted pixels that nothing in the cell explains, as far as is known.
+        outliers: [T, side, side] counted pixels that no picture of the cell explains, so far.
     """
 
     def __init__(self, photo: TiledPhoto, dimensions: int) -> None:
@@ -145,7 +145,7 @@ class BoundedPixels:
         )  # fmt: skip
 
     def add(self, bounds: Bounds, tiles: np.ndarray, pixels: np.ndarray) -> None:
-        """Take the bounds of ``tiles`` [t] at ``pixels`` [T, side, side], all of which lie in these tiles."""
+        """Add the bounds of ``tiles`` [t] at ``pixels`` [T, side, side], all of which lie in these tiles."""
         chosen = pixels[tiles]
         self.lower[pixels], self.upper[pixels] = bounds.lower[chosen], bounds.upper[chosen]
         assert bounds.linear is not None
@@ -159,14 +159,14 @@ class BoundedPixels:
 
     @property
     def reach(self) -> tuple[Float64Array, Float64Array]:
-        """What the bounded pixels leave of the cell's scaled parameters (U3); see `TiledPhoto.reach`."""
+        """Return the ends of the scaled parameters that the bounded pixels do not exclude; see `TiledPhoto.reach`."""
         beyond = self.outliers | self.photo.beyond(self.lower, self.upper, self._tiles)
         return self.photo.reach(self.linear, beyond, self._tiles)
 
     def best_fit(self, steps: int) -> Float64Array | None:
-        """Scaled parameters [d] where the linear bounds' middle explains most, by ``steps`` weighted least squares.
+        """Return scaled parameters [d] at which the linear bounds' middle explains most pixels; None: there are none.
 
-        None: there are none.
+        They are found by ``steps`` weighted least squares.
         """
         counted, d = self.photo.counted, self.linear[0].shape[-1]
         b = 0.5 * (self.linear[1].astype(np.float64) + self.linear[3])[counted].reshape(-1)

@@ -29,9 +29,9 @@ class Preprocess:
     """``y = (low + x (high - low) - mean) / std`` per channel, in the network's order of channels.
 
     Attributes:
-        resize: Height and width of the network's input, or None where the camera path has them already.
-        mean, std: Three numbers each, for the channels as the network sees them.
-        range: What the picture's 0 and 1 become before mean and std.
+        resize: Height and width of the network's input, or None if the camera path has them already.
+        mean, std: Three numbers each, in the network's order of channels.
+        range: The values that the picture's 0 and 1 become, before mean and std.
     """
 
     resize: tuple[int, int] | None = None
@@ -42,10 +42,10 @@ class Preprocess:
     range: tuple[float, float] = (0.0, 1.0)
 
     def size(self, input_shape: tuple[int, ...]) -> tuple[int, int]:
-        """Height and width of a network's input of this layout.
+        """Return height and width of a network's input of this layout.
 
         Raises:
-            InputError: The input is no picture with three channels, or ``resize`` says something else.
+            InputError: The input is no picture with three channels, or contradicts ``resize``.
         """
         shape = input_shape if self.layout == "NCHW" else input_shape[-1:] + input_shape[:-1]
         if len(shape) != 3 or shape[0] != 3:
@@ -65,11 +65,11 @@ class Preprocess:
 
     @property
     def whole_numbers(self) -> bool:
-        """Whether pictures of 8 bits become their whole numbers from 0 to 255."""
+        """Whether 8-bit pictures become their whole numbers from 0 to 255."""
         return self.range == (0.0, 255.0) and not any(self.mean) and all(part == 1.0 for part in self.std)
 
     def loading(self, output: str | None) -> dict[str, Any]:
-        """Keywords of `load_network`: the output, the size of pictures where it is free, and what they look like."""
+        """Return keyword arguments for `load_network`: the output, the size of pictures where it is free, samples."""
         return {
             "output": output,
             "picture": self.resize,
@@ -79,7 +79,7 @@ class Preprocess:
         }
 
     def _samples(self, input_shape: tuple[int, ...]) -> Iterator[np.ndarray]:
-        """Inputs [1, *input_shape] of dark, bright and random pictures; none if the network takes no pictures."""
+        """Yield inputs [1, *input_shape] of dark, bright and random pictures; none if the network takes no pictures."""
         try:
             height, width = self.size(input_shape)
         except InputError:
@@ -93,7 +93,7 @@ class Preprocess:
         return np.array(self.mean), np.array(self.std), low, high - low
 
     def apply(self, images: torch.Tensor) -> torch.Tensor:
-        """Network inputs [B, *input_shape] from pictures [B, H, W, 3] (RGB in [0, 1]), in their dtype."""
+        """Return network inputs [B, *input_shape] for pictures [B, H, W, 3] (RGB in [0, 1]), in their type."""
         if self.channels == "BGR":
             images = images.flip(-1)
         mean, std, low, scale = self._constants()
@@ -104,7 +104,7 @@ class Preprocess:
     def input_sets(
         self, linear: tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray], lower: np.ndarray, upper: np.ndarray
     ) -> ImageSets:
-        """Linear sets of network inputs, with every float32 evaluation of `apply`, from those of pictures (V1).
+        """Return linear sets of network inputs, for those of pictures, with every float32 evaluation of `apply` (V1).
 
         Args:
             linear: A_lower [m, H, W, 3, d], b_lower [m, H, W, 3], A_upper, b_upper of m cells.
@@ -136,11 +136,11 @@ class Preprocess:
         )
 
     def _ordered(self, array: np.ndarray, after: int) -> np.ndarray:
-        """Channels as the network has them; ``after``: axes behind the one of channels."""
+        """Return the array with channels in the network's order; ``after``: number of axes behind the channels."""
         return np.flip(array, array.ndim - 1 - after) if self.channels == "BGR" else array
 
     def _flat(self, array: np.ndarray, after: int) -> np.ndarray:
-        """[m, H, W, 3, ...] as [m, n, ...] in the layout's order."""
+        """Return [m, H, W, 3, ...] as [m, n, ...] in the layout's order."""
         if self.layout == "NCHW":
             array = np.moveaxis(array, array.ndim - 1 - after, 1)
         rest = array.shape[array.ndim - after :]

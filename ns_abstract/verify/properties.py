@@ -1,9 +1,9 @@
-"""Properties of a network on every image of a set: their file, their concrete check, and their proof.
+"""Properties of a network on every image of a set: their concrete check, and their proof.
 
-A property is a margin, a function of the network's outputs and the pose: it holds where the margin is
-above 0 (docs/dev/design.md, V2-V5). ``Property`` is what the file says; ``bind`` makes it a ``Claim`` about
-one frame's set of poses, which knows the margin of concrete outputs, the linear rows whose lower bounds are
-needed for a proof, and what they prove.
+A property holds where its margin, a function of the network's outputs and the pose, is positive (docs/dev/design.md,
+V2-V5). A ``Property`` is the content of a file; ``bind`` makes it a ``Claim`` about one frame's set of poses. A claim
+knows the margin of concrete outputs, the linear rows whose lower bounds a proof needs, and the bound of the margin that
+these prove.
 """
 
 from __future__ import annotations
@@ -52,18 +52,18 @@ class Claim(ABC):
 
     @abstractmethod
     def margin(self, outputs: torch.Tensor, values: torch.Tensor) -> torch.Tensor:
-        """[B] margins of outputs [B, n] at parameter values [B, d]; the property holds where above 0."""
+        """Return margins [B] of outputs [B, n] at parameter values [B, d]; the property holds where positive."""
 
     @abstractmethod
     def query(self, outputs: np.ndarray) -> Query:
-        """The bounds that a proof needs, given outputs [s, n] seen inside the cells."""
+        """Return the rows whose bounds a proof needs, given outputs [s, n] of samples in the cells."""
 
     @abstractmethod
     def proved(self, query: Query, bounds: OutputBounds, boxes: Sequence[ParameterBox]) -> np.ndarray:
-        """[m] lower bounds of the margin over the cells ``boxes``; -inf where nothing is known."""
+        """Return lower bounds [m] of the margin over the cells ``boxes``; -inf where none is known."""
 
     def refuted(self, query: Query, bounds: OutputBounds, boxes: Sequence[ParameterBox]) -> np.ndarray:
-        """[m] upper bounds of the margin over the cells ``boxes``; infinite where nothing is known."""
+        """Return upper bounds [m] of the margin over the cells ``boxes``; infinite where none is known."""
         return np.full(len(boxes), np.inf)
 
 
@@ -80,11 +80,11 @@ class Property(ABC):
 
     @abstractmethod
     def bind(self, pose_set: PoseBox, nominal: Callable[[], np.ndarray]) -> Claim:
-        """The claim about a frame; ``nominal`` gives outputs [n] at the middle of the set."""
+        """Return the claim about a frame; ``nominal`` returns outputs [n] at the middle of the set."""
 
     @property
     def notes(self) -> tuple[str, ...]:
-        """What was set aside, one sentence each."""
+        """Sentences on parts of the file that are ignored."""
         return ()
 
 
@@ -93,7 +93,7 @@ class Property(ABC):
 
 @dataclass(frozen=True)
 class LinearClaim(Claim):
-    """Margin ``min over groups of max over the group's rows of rows @ y + offset`` (V2)."""
+    """A claim with margin ``min over groups of max over the group's rows of rows @ y + offset`` (V2)."""
 
     rows: np.ndarray
     offset: np.ndarray
@@ -115,7 +115,7 @@ class LinearClaim(Claim):
 
 @dataclass(frozen=True)
 class Classification(Property):
-    """The logit of ``label`` is the largest."""
+    """The property that the logit of ``label`` is the largest."""
 
     label: int
     classes: int
@@ -134,7 +134,7 @@ class Classification(Property):
 
 @dataclass(frozen=True)
 class VnnLibProperty(Property):
-    """No output is in the unsafe set of a VNN-LIB file."""
+    """The property that no output is in the unsafe set of a VNN-LIB file."""
 
     file: Path
     unsafe: UnsafeSet
@@ -162,9 +162,9 @@ class TrueValues:
 
     Attributes:
         components: A number, or one of ``camera.x`` ... (position minus origin, world axes), ``object.x``
-            ... (origin seen from the camera, its own axes: x right, y up, z back), ``distance``.
+            ... (origin in camera coordinates: x right, y up, z back), ``distance``.
         origin: World point, normalised frame.
-        scale: Multiplies what is not a number: units of the network per normalised unit.
+        scale: Factor on every component that is no number: network units per normalised unit.
     """
 
     components: tuple[float | str, ...]
@@ -172,7 +172,7 @@ class TrueValues:
     scale: float = 1.0
 
     def forms(self, pose_set: PoseBox, box: ParameterBox) -> FormArray:
-        """[c] forms of order 1 that enclose the values over a cell."""
+        """Return forms [c] of order 1 that enclose the values over a cell."""
         poses = pose_set.enclosure(box, 1)
         # OpenCV to OpenGL camera axes
         flip = np.array([1.0, -1.0, -1.0])
@@ -192,7 +192,7 @@ class TrueValues:
         return FormArray(basis, np.ascontiguousarray(np.concatenate(columns, axis=1)), (len(columns),))
 
     def at(self, pose: torch.Tensor) -> torch.Tensor:
-        """[c] values at a camera-to-world pose [3, 4]."""
+        """Return values [c] at a camera-to-world pose [3, 4]."""
         origin = torch.tensor(self.origin, dtype=pose.dtype)
         camera = pose[:, 3] - origin
         in_camera = -(pose[:, :3].T @ camera)
@@ -264,7 +264,7 @@ class RegressionClaim(Claim):
 
 @dataclass(frozen=True)
 class Regression(Property):
-    """Outputs within a tolerance of the truth."""
+    """The property that outputs are within a tolerance of the truth."""
 
     truth: TrueValues
     absolute: tuple[float, ...] | None
@@ -287,11 +287,12 @@ class Regression(Property):
 
 
 def decode(outputs: torch.Tensor, stride: float) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
-    """The VOC TinyYOLO head, after Redmon and Farhadi's YOLOv2 (V4), of pictures with ``stride`` pixels by grid cell.
+    """Return objectness, class probabilities and boxes of the VOC TinyYOLO head (V4, after Redmon and Farhadi).
 
     Args:
         outputs: [B, 125 g g]: channels of [125, g, g] are 5 objectness logits, 5 x 20 class logits and 5 x 4 numbers
             tx, ty, tw, th, each by anchor.
+        stride: Pixels by grid cell.
 
     Returns:
         Objectness [B, 5, g, g], class probabilities [B, 5, 20, g, g], and boxes [B, 5, 4, g, g] x0, y0, x1, y1 in
@@ -329,7 +330,7 @@ class DetectionClaim(Claim):
     grid: int
 
     def margins(self, outputs: torch.Tensor) -> torch.Tensor:
-        """[B, 5 g g] margins box by box."""
+        """Return margins [B, 5 g g] by box."""
         objectness, classes, boxes = decode(outputs, self.stride)
         score = objectness if self.label is None else objectness * classes[:, :, self.label]
         margin = score - self.confidence
@@ -356,7 +357,7 @@ class DetectionClaim(Claim):
         return Query(np.concatenate(rows), np.zeros(sum(map(len, rows))), tuple(chosen))
 
     def _rows(self, number: int) -> np.ndarray:
-        """Objectness; class logit minus each other; tx, ty, tw, th and their negatives."""
+        """Return a box's rows: objectness; class logit minus each other; tx, ty, tw, th and their negatives."""
         plane = self.grid * self.grid
         anchor, place = divmod(number, plane)
 
@@ -390,7 +391,7 @@ class DetectionClaim(Claim):
         return margins
 
     def _candidate(self, lower: np.ndarray, number: int) -> np.ndarray:
-        """[m] lower bounds of one box's margin."""
+        """Return lower bounds [m] of one box's margin."""
         score = _sigmoid(lower[:, 0])[0]
         count = 1
         if self.label is not None:
@@ -403,7 +404,7 @@ class DetectionClaim(Claim):
         return np.minimum(margin, self._overlap(lower[:, count : count + 4], -lower[:, count + 4 :], number))
 
     def _overlap(self, low: np.ndarray, high: np.ndarray, number: int) -> np.ndarray:
-        """[m] lower bounds of the overlap minus its threshold, from ranges [m, 4] of tx, ty, tw, th."""
+        """Return lower bounds [m] of the overlap minus its threshold, for ranges [m, 4] of tx, ty, tw, th."""
         assert self.iou is not None and self.box is not None
         anchor, place = divmod(number, self.grid * self.grid)
         row, column = divmod(place, self.grid)
@@ -432,14 +433,14 @@ class DetectionClaim(Claim):
 
 
 def _sigmoid(x: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Lower and upper bounds of the sigmoid of float64 numbers."""
+    """Return lower and upper bounds of the sigmoid of float64 numbers."""
     value = 1.0 / (1.0 + np.exp(-x))
     return value * (1.0 - OWN_MARGIN), np.minimum(value * (1.0 + OWN_MARGIN), 1.0)
 
 
 @dataclass(frozen=True)
 class Detection(Property):
-    """A box of the class is found on every image."""
+    """The property that a box of the class is detected on every image."""
 
     label: int | None
     confidence: float

@@ -1,4 +1,4 @@
-"""Property files: which keys they may have, and the properties that they state."""
+"""Reads property files: checks their keys, and makes the properties that they state."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ _COMMON = ("type", "preprocess", "partitions", "output")
 
 
 class _KeySetting(NamedTuple):
-    """What a parser knows beside the file: where it lies, numbers of the network's inputs and outputs, the picture."""
+    """What a parser needs beside the JSON object: its folder, the network's input and output sizes, the picture."""
 
     folder: Path
     inputs: int
@@ -40,14 +40,14 @@ class _KeySetting(NamedTuple):
 
 
 class _Type(NamedTuple):
-    """The keys of a type of property, and what makes the property of the file's object and the common attributes."""
+    """A type of property: its keys, and the function that makes it from the JSON object and the common attributes."""
 
     keys: tuple[str, ...]
     parse: Callable[[dict[str, Any], _KeySetting, dict[str, Any]], Property]
 
 
 def loading(root: Any) -> dict[str, Any]:
-    """Return the keywords of `load_network` in a parsed PROP.json: the output, and the size of the pictures."""
+    """Return the keyword arguments for `load_network` in a parsed PROP.json: the output, and the pictures' size."""
     if not isinstance(root, dict):
         return {}
     output = root.get("output")
@@ -80,7 +80,7 @@ def property_keys() -> dict[str, tuple[str, ...]]:
 
 
 def parse_partitions(root: dict[str, Any]) -> tuple[int, ...] | None:
-    """Return the fixed partition that a parsed PROP.json asks for, or None."""
+    """Return the fixed partition that a parsed PROP.json states, or None."""
     value = root.get("partitions")
     if value is None:
         return None

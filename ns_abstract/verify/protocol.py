@@ -21,30 +21,30 @@ class FrameImages(Protocol):
     box: ParameterBox
 
     def image(self, values: np.ndarray, scene_sample: SceneSample | None = None) -> np.ndarray:
-        """Concrete picture [H, W, 3] float32 at parameter values [d], of another scene of the set if one is named."""
+        """Return the picture [H, W, 3] float32 at parameter values [d], of ``scene_sample`` if it is given."""
         ...
 
     def scene_samples(self, seed: int) -> Iterator[SceneSample]:
-        """Other scenes of the set, without end; none where only poses vary."""
+        """Yield other scenes of the set, without end; none where only poses vary."""
         ...
 
     def linear_sets(self, box: ParameterBox) -> PixelSets:
-        """(A_lower, b_lower, A_upper, b_upper) [H, W, 3, d] and [H, W, 3], lower, upper, and slopes [d]."""
+        """Return (A_lower, b_lower, A_upper, b_upper) [H, W, 3, d] and [H, W, 3]; lower, upper; and slopes [d]."""
         ...
 
     def differentiable(self, values: torch.Tensor) -> torch.Tensor:
-        """Picture [H, W, 3] at parameter values [d], differentiable."""
+        """Return the picture [H, W, 3] at parameter values [d], differentiable."""
         ...
 
 
 @runtime_checkable
 class NearImages(Protocol):
-    """An optional interface of `FrameImages`: what is known around a cell makes its pictures cheaper."""
+    """An optional interface of `FrameImages`: pictures in a cell are cheaper with bounds around it."""
 
     def near(self, cell: ParameterBox) -> FrameImages:
-        """Pictures and sets for poses of ``cell`` and boxes inside it.
+        """Return the pictures and sets for poses of ``cell`` and boxes inside it.
 
-        Every margin has the sign of that of the picture as it is, though pixels may have other values.
+        Pixels may have other values than the picture's, but every margin has the sign of the picture's.
         """
         ...
 
@@ -55,30 +55,30 @@ PixelSets = tuple[tuple[np.ndarray, ...], np.ndarray, np.ndarray, np.ndarray]
 
 @runtime_checkable
 class DividedImages(Protocol):
-    """An optional interface of `FrameImages`: bounds over equal sub-boxes of a cell cost little beside its sets."""
+    """An optional interface of `FrameImages`: bounds over sub-boxes of a cell cost little in addition to its sets."""
 
     def sub_box_counts(self, box: ParameterBox, most: int) -> np.ndarray | None:
-        """[d] into how many sub-boxes a cell is best divided, powers of two, ``most`` together; None: into none."""
+        """Return the best numbers [d] of sub-boxes of a cell, powers of two, ``most`` together; None: none."""
         ...
 
     def divided_sets(self, box: ParameterBox, counts: np.ndarray) -> tuple[PixelSets, SubBoxEnds | None]:
-        """`FrameImages.linear_sets`, and bounds over sub-boxes of pixels that decide; None: there are no such pixels.
+        """Return `FrameImages.linear_sets`, and sub-box bounds of the pixels that decide; None: there are none.
 
         There are ``counts`` [d] sub-boxes, at least 8.
         """
         ...
 
     def narrowed(self, ends: SubBoxEnds, sub_boxes: np.ndarray) -> FrameImages:
-        """Pictures, for bounds alone, of what some ``sub_boxes`` [counts] of a cell cover, over which ``ends`` hold."""
+        """Return pictures, for bounds alone, over some ``sub_boxes`` [counts] of a cell with bounds ``ends``."""
         ...
 
 
 @runtime_checkable
 class ComparedCuts(Protocol):
-    """An optional interface of `FrameImages`: cuts of a cell are compared by bounds of narrower cells."""
+    """An optional interface of `FrameImages`: compares cuts of a cell by bounds of narrower cells."""
 
     def cut_gains(self, box: ParameterBox) -> np.ndarray:
-        """[d] what a cut of the cell along each parameter may gain, in place of the slopes of its sets."""
+        """Return the gain [d] of a cut of the cell along each parameter, in place of its sets' slopes."""
         ...
 
 
@@ -86,38 +86,38 @@ class Model(Protocol):
     """A network with its preprocessing."""
 
     def outputs(self, images: np.ndarray) -> np.ndarray:
-        """[B, n] outputs that the deployed program gives for pictures [B, H, W, 3]."""
+        """Return outputs [B, n] of the deployed program for pictures [B, H, W, 3]."""
         ...
 
     def differentiable(self, images: torch.Tensor) -> torch.Tensor:
-        """[B, n] outputs for pictures [B, H, W, 3], differentiable."""
+        """Return outputs [B, n] for pictures [B, H, W, 3], differentiable."""
         ...
 
     def input_sets(self, linear: tuple[np.ndarray, ...], lower: np.ndarray, upper: np.ndarray) -> ImageSets:
-        """Sets of the network's input; see `ns_abstract.verify.preprocess.Preprocess.input_sets`."""
+        """Return sets of the network's input; see `ns_abstract.verify.preprocess.Preprocess.input_sets`."""
         ...
 
     def bound(self, images: ImageSets, query: Query) -> OutputBounds:
-        """Bounds of the query's rows over the sets."""
+        """Return bounds of the query's rows over the sets."""
         ...
 
     def branch(self, images: ImageSets, query: Query, groups: Sequence[Sequence[int]], most_branches: int) -> float:
-        """A lower bound of the margin of a linear claim over one set, by at most so many branches."""
+        """Return a lower bound of the margin of a linear claim over one set, by at most ``most_branches`` branches."""
         ...
 
 
 @runtime_checkable
 class PartsModel(Model, Protocol):
-    """An optional interface of `Model`: bounds of parts of a cell cost next to nothing beside its sets."""
+    """An optional interface of `Model`: bounds of parts of a cell cost little in addition to its sets."""
 
     def part_counts(self, images: ImageSets, most_parts: int) -> np.ndarray:
-        """[d] into how many parts one cell is best divided along its parameters, powers of two."""
+        """Return the best numbers [d] of parts of one cell along its parameters, powers of two."""
         ...
 
     def bound_parts(self, images: ImageSets, counts: np.ndarray, ends: SubBoxEnds | None = None) -> OutputBounds:
-        """Bounds of the query's rows over equal parts of one cell, a row for each, the last parameter's first.
+        """Return bounds of the query's rows over equal parts of one cell, a row each; the last parameter is fastest.
 
-        Parts reach by `SUB_BOX_OVERLAP` of the cell's half-widths beyond their ends; ``ends`` bound pixels over the
+        Parts extend by `SUB_BOX_OVERLAP` of the cell's half-widths beyond their ends; ``ends`` bound pixels over the
         same parts.
         """
         ...

@@ -1,6 +1,6 @@
-"""Pictures of a scene whose registration is uncertain: the whole scene may be shifted (docs/dev/design.md, V13, P3).
+"""Pictures of a scene with uncertain registration: the whole scene may be shifted (docs/dev/design.md, V13, P3).
 
-Where the scene stands is three parameters more, which sets of pictures and bounds keep until the end.
+The scene's position adds three parameters, which sets of pictures and bounds keep until the outputs.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ PLACE = 3
 
 
 class RegisteredImages:
-    """Pictures of poses for every position of the scene, of a set of `PoseBox.registered`; see `FrameImages`."""
+    """Pictures at every pose and position of the scene in a set of `PoseBox.registered`; see `FrameImages`."""
 
     def __init__(self, scene: FrameImages, frame: Frame) -> None:
         self.scene, self.frame = scene, frame
@@ -40,7 +40,7 @@ class RegisteredImages:
         )
 
     def scene_samples(self, seed: int) -> Iterator[RegisteredSample]:
-        """Places of the scene, without end, corners first."""
+        """Yield positions of the scene without end, corners first."""
         for signs in itertools.product((-1.0, 1.0), repeat=PLACE):
             yield RegisteredSample(self, self.reach * signs)
         generator = np.random.default_rng(seed)
@@ -48,13 +48,13 @@ class RegisteredImages:
             yield RegisteredSample(self, self.reach * generator.uniform(-1.0, 1.0, PLACE))
 
     def widened(self, box: ParameterBox) -> ParameterBox:
-        """A box of poses with all places of the scene."""
+        """Return a box of poses extended by all positions of the scene."""
         whole = self.scene.box
         lower, upper = (*box.lower, *whole.lower[-PLACE:]), (*box.upper, *whole.upper[-PLACE:])
         return ParameterBox(whole.names, whole.units, lower, upper)
 
     def linear_sets(self, box: ParameterBox) -> tuple[tuple[np.ndarray, ...], np.ndarray, np.ndarray, np.ndarray]:
-        """As a scene's, but the linear sets have `PLACE` parameters more."""
+        """Return linear sets like a scene's, with the three `PLACE` parameters added."""
         linear, lower, upper, slopes = self.scene.linear_sets(self.widened(box))
         return linear, lower, upper, slopes[:-PLACE]
 
@@ -89,7 +89,7 @@ class RegisteredSample:
 
     @property
     def arrays(self) -> dict[str, np.ndarray]:
-        """Where the scene stands."""
+        """Return the position of the scene."""
         return {"place": self.offset}
 
 
@@ -99,7 +99,7 @@ def _sign(leaf: torch.Tensor) -> np.ndarray:
 
 
 class RegisteredModel:
-    """A network behind such pictures; see `ns_abstract.verify.protocol.Model`."""
+    """A network whose input is such pictures; see `ns_abstract.verify.protocol.Model`."""
 
     def __init__(self, model: Model) -> None:
         self.model = model
@@ -108,7 +108,7 @@ class RegisteredModel:
         self.branch = model.branch
 
     def bound(self, images: ImageSets, query: Query) -> OutputBounds:
-        """Bounds in the poses' parameters, for all places of the scene."""
+        """Return bounds in the poses' parameters, over all positions of the scene."""
         output_bounds = self.model.bound(images, query)
         image_dimensions = images.dimensions - PLACE
         lost = np.abs(output_bounds.a[..., image_dimensions:]).sum(axis=-1)

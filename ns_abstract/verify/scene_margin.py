@@ -1,7 +1,7 @@
 """The scene margin: the largest variation of the scene that keeps a certificate, by bisection (design.md, V13).
 
-Cells that were certified for the stored scene are bounded again for all scenes around it. Sets of scenes are nested, so
-what is proved of a radius holds of every smaller one, and one pass over the cells with the smallest radius so far does.
+Cells that were certified for the stored scene are bounded again for all scenes around it. Sets of scenes are nested: a
+proof for a radius holds for every smaller one. So one pass over the cells suffices, with the smallest radius so far.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ Outcome = Literal["holds", "falsified", "unknown"]
 
 @dataclass(frozen=True)
 class MarginTuning:
-    """How a margin is searched for; what is claimed is what was proved of the last radius that held."""
+    """Preferences of the search for a margin; the result is what was proved for the last radius that held."""
 
     #: Bisection ends where the ends are this close, by their quotient; radii tried first grow and shrink by `stride`.
     close: float = 1.1
@@ -53,7 +53,7 @@ class VariationKind:
 
     Attributes:
         name: Key of a scene variation, of `KINDS`.
-        place: Parameters of where the scene as a whole stands, if these vary (`PoseBox.registered`).
+        place: Parameters of the whole scene's position, if these vary (`PoseBox.registered`).
     """
 
     name: str
@@ -65,7 +65,7 @@ class VariationKind:
     place: tuple[str, ...] = ()
 
     def variation(self, radius: float) -> SceneVariation:
-        """All scenes around the stored one."""
+        """Return the set of all scenes within ``radius`` of the stored one."""
         ends: dict[str, Any] = {self.name: (-radius, radius)}
         return SceneVariation(Selection(), **ends)
 
@@ -104,15 +104,15 @@ PLACES = (REGISTRATION, TURN)
 
 
 def bounded_kinds(places: Callable[[VariationKind], bool]) -> tuple[VariationKind, ...]:
-    """All kinds of variation, of the whole scene those that ``places`` says can be bounded beside the pose."""
+    """Return all kinds of variation; those of the whole scene only if ``places`` says that they can be bounded."""
     return (*KINDS, *CAMERA_KINDS, *(kind for kind in PLACES if places(kind)))
 
 
 @dataclass(frozen=True)
 class CellOutcome:
-    """The outcome of a cell for all scenes of a set, with arrays of a scene that breaks it.
+    """The outcome of a cell for all scenes of a set, with the arrays of a scene that breaks it.
 
-    ``slopes`` [d] are what a cut along each parameter may gain.
+    ``slopes`` [d] are the gains of a cut along each parameter.
     """
 
     outcome: Outcome
@@ -127,7 +127,7 @@ ProveCell = Callable[[float, int, ParameterBox], CellOutcome]
 
 @dataclass(frozen=True)
 class CertifiedBox:
-    """A certified cell with its proved margin, and its part of all that is certified, by volume."""
+    """A certified cell with its proved margin, and its fraction of the certified volume."""
 
     frame: int
     box: ParameterBox
@@ -137,7 +137,7 @@ class CertifiedBox:
 
 @dataclass(frozen=True)
 class Trial:
-    """A cell at a radius."""
+    """A cell at a radius, with its outcome."""
 
     cell: int
     radius: float
@@ -152,11 +152,11 @@ class SceneMargin:
     """The result of a bisection.
 
     Attributes:
-        radius: All that was certified holds for all scenes this far from the stored one; 0: nothing more is known.
-        reached, part: Radius at which the part of the certified volume holds that was looked at.
+        radius: All certified cells hold for all scenes this far from the stored one; 0: nothing more is known.
+        reached, part: Radius at which the examined fraction of the certified volume holds, and that fraction.
         state: "done", or "ended": by the time, or by a request to stop.
-        cells: How many are certified.
-        example: Arrays that tell the scene of the smallest falsified radius, or None.
+        cells: Number of certified cells.
+        example: Arrays of the scene at the smallest falsified radius, or None.
     """
 
     kind: VariationKind
@@ -175,17 +175,17 @@ class SceneMargin:
 
     @property
     def failing(self) -> Trial | None:
-        """The smallest radius that is not certified."""
+        """The trial with the smallest radius that is not certified."""
         return self._least("falsified", "unknown")
 
     @property
     def falsified(self) -> Trial | None:
-        """The smallest radius at which a scene was found that breaks what is certified."""
+        """The trial with the smallest radius at which a scene breaks a certified cell."""
         return self._least("falsified")
 
     @property
     def sentence(self) -> str:
-        """All of it for people."""
+        """The result as text."""
         kind, failing = self.kind, self.failing
         if self.radius > 0.0:
             more = " (no larger one was tried)" if self.radius >= kind.largest else ""
@@ -206,7 +206,7 @@ class SceneMargin:
 
     @property
     def entry(self) -> dict[str, Any]:
-        """What report.json holds."""
+        """The entry of report.json."""
 
         def record(trial: Trial | None) -> dict[str, Any] | None:
             return None if trial is None else vars(trial)
@@ -235,8 +235,7 @@ def largest_radius(
 ) -> SceneMargin:
     """Return the largest radius, within a tenth, for which every cell is proved again (V13).
 
-    ``prove``: sound bounds and an attack of one cell. ``over``: whether to end with what is known, asked about once a
-    second.
+    ``prove``: bounds and attacks one cell. ``over``: whether to end with the result so far, called about once a second.
     """
     begin = time.perf_counter()
     margin = SceneMargin(kind, len(cells))
@@ -273,7 +272,7 @@ class _Bisection:
         self.margin, self.kind, self.prove = margin, margin.kind, prove
 
     def largest(self, number: int, cell: CertifiedBox, ceiling: float | None) -> float:
-        """The largest radius for one cell, of which more than ``ceiling`` is of no use; None: it is the first."""
+        """Return the largest radius for one cell, up to ``ceiling``; None: it is the first cell."""
         most = self.kind.largest if ceiling is None else ceiling
         radius = min(self.kind.first, most) if ceiling is None else ceiling
         low, high = 0.0, math.inf
@@ -292,7 +291,7 @@ class _Bisection:
         return low
 
     def attack(self, failing: Trial, cell: CertifiedBox) -> None:
-        """Larger radii, until a scene breaks what is certified."""
+        """Try larger radii until a scene breaks the cell."""
         radius = failing.radius
         for _ in range(_TUNING.doublings):
             if radius >= self.kind.largest:
@@ -303,7 +302,7 @@ class _Bisection:
                 return
 
     def _try(self, number: int, cell: CertifiedBox, radius: float, *, cuts: bool = True) -> bool:
-        """Whether a cell is proved for a radius."""
+        """Return whether a cell is proved for a radius."""
         begin = time.perf_counter()
         outcome, reason, parts, example = self._examined(cell, radius, cuts)
         trial = Trial(number, radius, outcome, reason, parts, time.perf_counter() - begin)
@@ -316,7 +315,7 @@ class _Bisection:
     def _examined(
         self, cell: CertifiedBox, radius: float, cuts: bool
     ) -> tuple[Outcome, str, int, Mapping[str, np.ndarray] | None]:
-        """The cell, cut where it is not proved as a whole: all parts must be."""
+        """Return the outcome of the cell, cut where it is not proved as a whole: all parts must be proved."""
         grid = CellGrid.adaptive(cell.box, [1] * cell.box.dimensions)
         waiting: list[tuple[Cell, int]] = [(part, 0) for part in grid.roots()]
         count = 0
@@ -341,7 +340,7 @@ class _Bisection:
 
 
 def check_scenes(varied: bool, rays: bool) -> None:
-    """Raise InputError where a scene margin is not defined: there are no Gaussians, or they are ``varied`` already."""
+    """Raise InputError where no scene margin is defined: there are no Gaussians, or they already vary."""
     if rays:
         raise InputError("Gaussians vary, a NeRF has none", field="--scene-margin", fix="leave it out")
     if varied:

@@ -1,4 +1,4 @@
-"""Pictures of a set of poses, rendered and bounded as they are."""
+"""Pictures of a frame over a set of poses, rendered and bounded without further changes."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ class ScenePictures:
 
     @property
     def pose_set(self) -> PoseBox:
-        """The poses that may be looked at."""
+        """The set of all poses."""
         return self.frame.pose_set
 
     def image(self, values: np.ndarray, scene_sample: SceneSample | None = None) -> np.ndarray:
@@ -37,7 +37,7 @@ class ScenePictures:
         )
 
     def _bounds(self, box: ParameterBox) -> Bounds:
-        """Linear bounds of all tiles."""
+        """Return bounds of all tiles, with linear bounds."""
         return self.frame.bound(box, self._tiles, keep_linear=True)
 
     def linear_sets(self, box: ParameterBox) -> tuple[LinearSets, np.ndarray, np.ndarray, np.ndarray]:

@@ -1,7 +1,7 @@
 """The search for a proof or a counterexample, one block of cells at a time (docs/dev/design.md, V6).
 
-What becomes of a block depends on the block alone, so the result is the same in whatever order, on however
-many machines and after however many interruptions blocks are examined.
+The result of a block depends on the block alone. So the search's result is the same in whatever order, on however many
+machines and after however many interruptions blocks are examined.
 """
 
 from __future__ import annotations
@@ -72,10 +72,10 @@ class Search:
 
     Args:
         every_unit: Whether each unit of the grid needs a verdict of its own where the property fails (PCP-S).
-        cuts: Whether cells without a verdict are cut; else they are done with.
-        cover: Proves cells that are too wide part by part; None: they are cut.
-        costly: Whether bounds of the model cost so much that cells whose sets are wide are cut without them, and that
-            slopes of the margin are worth their time.
+        cuts: Whether cells without a verdict are cut; else they are finished.
+        cover: Proves wide cells sub-box by sub-box; None: they are cut.
+        costly: Whether the model's bounds are expensive: cells with wide sets are then cut without them, and slopes of
+            the margin are used.
     """
 
     def __init__(
@@ -99,31 +99,31 @@ class Search:
         self.varies = next(iter(scene.scene_samples(0)), None) is not None
 
     def _near(self, box: ParameterBox) -> FrameImages:
-        """Pictures of a cell."""
+        """Return the pictures of a cell."""
         return self.scene.near(box) if isinstance(self.scene, NearImages) else self.scene
 
     def margins(
         self, samples: Sequence[Sample], scenes: Sequence[FrameImages] | None = None
     ) -> tuple[np.ndarray, np.ndarray]:
-        """[s] concrete margins and [s, n] outputs at poses, drawn by ``scenes`` or the set's pictures."""
+        """Return margins [s] and outputs [s, n] of samples, rendered by ``scenes`` or the set's pictures."""
         drawn_by = [self.scene] * len(samples) if scenes is None else scenes
         images = [drawn(scene, sample) for scene, sample in zip(drawn_by, samples, strict=True)]
         self._latest = {sample_key(sample): image for sample, image in zip(samples, images, strict=True)}
         return self._judged(samples, images)
 
     def _judged(self, samples: Sequence[Sample], images: Sequence[np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
-        """`margins` of samples whose pictures are ``images``."""
+        """Return `margins` of samples with pictures ``images``."""
         outputs = np.asarray(self.model.outputs(np.stack(images)), np.float64)
         with torch.no_grad():
             margin = self.claim.margin(torch.from_numpy(outputs), torch.from_numpy(np.stack([p for p, _ in samples])))
         return margin.numpy(), outputs
 
     def examine(self, block: Sequence[Cell]) -> BlockResult:
-        """Examine the cells.
+        """Return the result of the cells.
 
         Raises:
             ContradictionError: A cell was proved and has a counterexample: the program has a fault.
-            WorkCancelledError: There is no time for it (`ns_abstract.execution.cancellation`).
+            WorkCancelledError: The deadline is over (`ns_abstract.execution.cancellation`).
         """
         begin = time.perf_counter()
         boxes = [self.grid.box_of(cell) for cell in block]
@@ -162,16 +162,16 @@ class Search:
     # ---------------------------------------------------------------- concrete poses
 
     def _early(self, cell: CellSamples) -> list[Sample]:
-        """The middle; and two opposite corners, if they cost less than bounds."""
+        """Return the middle, and two opposite corners if they cost less than bounds."""
         return [(cell.box.middle, None), *(self._corners(cell) if self.costly else ())]
 
     def _corners(self, cell: CellSamples) -> list[Sample]:
-        """Those of two opposite corners that no sample has been yet."""
+        """Return those of two opposite corners that have not been sampled."""
         ends = [np.array(end) for end in (cell.box.lower, cell.box.upper) if end]
         return [(end, None) for end in ends if end.tobytes() not in cell.poses]
 
     def _attack(self, cell: CellSamples) -> list[Sample]:
-        """A random pose and scene: no proof is believed without."""
+        """Return a random pose and scene: every proof is attacked."""
         generator = _generator(cell.cell)
         poses = list(cell.box.sample(1, generator)) if cell.box.dimensions else []
         if not self.varies:
@@ -180,7 +180,7 @@ class Search:
         return [(pose, scene_sample) for pose in poses or [cell.box.middle]]
 
     def _attack_parts(self, cell: CellSamples) -> list[Sample]:
-        """A random pose of one of the parts that are proved, and the middle of every part that is refuted."""
+        """Return a random pose of one proved part, and the middle of every refuted part."""
         generator = _generator(cell.cell)
         proved = [part.cell for part in cell.parts if part.verdict == "certified"]
         refuted = [self.grid.box_of(part.cell) for part in cell.parts if part.verdict == "falsified"]
@@ -193,11 +193,11 @@ class Search:
         return self.scene.scene_samples(int(_generator(cell.cell).integers(1 << 31)))
 
     def _late(self, cell: CellSamples) -> list[Sample]:
-        """Corners and random poses that no sample has been yet."""
+        """Return corners and random poses that have not been sampled."""
         return [(pose, None) for pose in cell.fresh_poses(_generator(cell.cell), _LATE, _RANDOM)]
 
     def _last(self, cell: CellSamples) -> list[Sample]:
-        """Poses at which the property may hold nevertheless: the more, the larger the cell is."""
+        """Return poses at which the property may hold after all, more for larger cells."""
         if self.every_unit:
             return []
         number = math.ceil(_WITNESSES * cell.cell.volume / self.grid.volume)
@@ -206,7 +206,7 @@ class Search:
         return [(pose, None) for pose in poses]
 
     def _sample(self, cells: Sequence[CellSamples], choose: Callable[[CellSamples], list[Sample]]) -> None:
-        """Add samples to the cells."""
+        """Add the samples that ``choose`` returns to the cells."""
         chosen = [choose(cell) for cell in cells]
         # neighbours share corners
         unique = {
@@ -225,10 +225,10 @@ class Search:
                 cell.outputs = outputs[place[sample_key(samples[0])]]
 
     def _vary(self, cells: Sequence[CellSamples]) -> None:
-        """Scenes of the set that break the property, at every pose looked at of every cell without a proof (V12).
+        """Attack every sampled pose of every unproved cell by other scenes of the set (V12).
 
-        The nearest is moved to the ends of its ranges along the signs of the margin's gradient, the worst by then half
-        as far, and the worst of all tried at the other poses, where it mostly breaks the property, too.
+        The stored scene is moved to the ends of its ranges along the signs of the margin's gradient, then the worst
+        scene half as far. The worst scene of all is tried at the other poses, where it mostly breaks the property, too.
         """
         scene_samples: list[SceneSample] = []
         for cell in sorted(cells, key=lambda c: c.margins[c.worst]):
@@ -249,16 +249,16 @@ class Search:
             self._shown(cell, [(other, best) for key, other in cell.poses.items() if key != pose.tobytes()])
 
     def _shown(self, cell: CellSamples, samples: list[Sample]) -> list[float]:
-        """Add samples to a cell; their margins."""
+        """Add samples to a cell and return their margins."""
         self._sample([cell], lambda _: samples)
         return cell.margins[len(cell.margins) - len(samples) :]
 
     def _loss(self, picture: torch.Tensor, values: torch.Tensor) -> torch.Tensor:
-        """The margin's negative."""
+        """Return the margin's negative."""
         return -self.claim.margin(self.model.differentiable(picture[None]), values[None])[0]
 
     def _descend_worst_cell(self, cells: Sequence[CellSamples]) -> None:
-        """Projected gradient descent of the margin in the cell that came closest to a counterexample.
+        """Descend the margin by projected gradients in the cell that came closest to a counterexample.
 
         With one parameter, and where a slope costs far more than bounds do, samples do better than gradients.
         """
@@ -271,14 +271,14 @@ class Search:
             self._sample([cell], lambda c: [(step, None)])
 
     def _slope(self, values: torch.Tensor) -> torch.Tensor:
-        """The margin at parameter values [d], differentiable."""
+        """Return the margin at parameter values [d], differentiable."""
         outputs = self.model.differentiable(self.scene.differentiable(values)[None])
         return self.claim.margin(outputs, values[None])[0]
 
     # ---------------------------------------------------------------- bounds
 
     def _bound(self, cells: Sequence[CellSamples]) -> None:
-        """Lower bounds of the margin by cell; what fails leaves a reason and no bound, maybe how to cut the cell."""
+        """Bound the margin of each cell; a cell without a bound gets the reason, and perhaps how to cut it."""
         usable: list[CellSamples] = []
         parts: list[Any] = []
         for cell in cells:
@@ -336,13 +336,13 @@ class Search:
         return isinstance(self.model, PartsModel) and self._splittable(cell)
 
     def _sets(self, cell: CellSamples) -> tuple[PixelSets, SubBoxEnds | None]:
-        """Sets of a cell, and bounds over its sub-boxes where these are looked at."""
+        """Return sets of a cell, and bounds over its sub-boxes, or None."""
         if self._divisible(cell.cell):
             return divided_sets(cell.scene, cell.cell, cell.box)
         return cell.scene.linear_sets(cell.box), None
 
     def _decided(self, cell: CellSamples, query: Query, images: ImageSets) -> list[CellPart]:
-        """Parts that tile a cell, where some of them are decided (Q8); what is left is bounded once more by itself."""
+        """Return parts that tile a cell if some are decided (Q8); an open part is bounded again by itself."""
         assert isinstance(self.model, PartsModel)
         question = PartQuestion(self.claim, self.model, query, refute=not self.every_unit)
         parts: list[CellPart] = []
@@ -355,7 +355,7 @@ class Search:
         return parts
 
     def _too_wide(self, cell: CellSamples, sets: PictureSets) -> bool:
-        """Whether the network's bounds would be wasted on the sets: a guess by the margin's gradient at the middle."""
+        """Return whether the sets are too wide for the network's bounds: an estimate by the margin's gradient."""
         weights = self._weights(cell)
         cell.cost = math.nan if weights is None else weights.cost(sets)
         return float(sets.widths.mean()) > _HOPELESS or cell.cost > _COSTLY
@@ -364,7 +364,7 @@ class Search:
         return self.cover is not None and len(cell.first) > 1 and cell.volume > 1
 
     def _covered(self, cell: CellSamples) -> None:
-        """Bound a cell part by part, or find out how to cut it."""
+        """Bound a cell sub-box by sub-box, or find how to cut it."""
         weights = self._weights(cell)
         if weights is None or self.cover is None:
             return
@@ -382,14 +382,14 @@ class Search:
             cell.cuts = outcome.cuts
 
     def _weights(self, cell: CellSamples) -> PixelWeights | None:
-        """The margin's gradient at the middle, as a part of the margin; None where one of them is no number."""
+        """Return the margin's gradient at the middle, relative to the margin; None where it is not finite."""
         values = cell.box.middle
         image = self._latest.get(sample_key((values, None)))
         image = drawn(self.scene, (values, None)) if image is None else image
         return margin_weights(self.model, self.claim, image, values)
 
     def _branching(self, cell: CellSamples, margin: float) -> Sequence[Sequence[int]]:
-        """The claim's groups, if branches may prove a cell that cannot be cut any more, and nothing else can (N16)."""
+        """Return the claim's groups if only branching may prove a cell that cannot be cut further; else none (N16)."""
         if not isinstance(self.claim, LinearClaim) or self._splittable(cell.cell) or cell.broken or cell.undecided:
             return ()
         near = -_NEAR * min(cell.margins, default=0.0) < margin <= 0.0
@@ -441,9 +441,9 @@ class Search:
         return leaves, children
 
     def _rank(self, cell: CellSamples, bound: float | None) -> float:
-        """How many times the bound of ``cell`` misses the margin that samples show: its parts need about as many cuts.
+        """Return how many times the bound misses the margin of samples: about as many cuts are needed.
 
-        The nearest to a proof first go deep at once, and come back from where the property is about to fail.
+        Cells nearest to a proof go deep first, and return from where the property is about to fail.
         """
         share = cell.cell.volume / self.grid.volume
         if not self.costly:
@@ -463,7 +463,7 @@ class Search:
         return min((margin - bound) / margin, _RANK_UNKNOWN)
 
     def _cuts(self, cell: CellSamples, bound: float | None) -> tuple[float, int]:
-        """How many times narrower parts should be for a proof, and how many there may be."""
+        """Return how many times narrower parts should be for a proof, and the largest number of parts."""
         if cell.broken:
             return 0.25, 4
         if bound is None:
@@ -475,7 +475,7 @@ class Search:
         return max(_NARROWEST, min(0.5, (_LEFT * margin / (margin - bound)) ** (1.0 / _POWER))), _MOST_PARTS
 
     def _counterexample(self, cell: Cell, box: ParameterBox, sample: Sample) -> FinishedCell:
-        """What a sample in ``box`` says of a cell, rendered and classified once more."""
+        """Return the cell, falsified by a sample in ``box``, which is rendered and classified once more."""
         values, scene_sample = sample
         image = drawn(self.scene, sample)
         margins, outputs = self._judged([sample], [image])

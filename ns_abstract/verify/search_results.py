@@ -1,4 +1,4 @@
-"""What a search says of a cell and of a block of cells, and the faults that end one cell alone."""
+"""Results of a search for a cell and for a block of cells, and the errors that end one cell alone."""
 
 from __future__ import annotations
 
@@ -18,12 +18,12 @@ class FinishedCell:
     """A finished cell with its verdict.
 
     Attributes:
-        margin: Proven lower bound of the margin; that of the counterexample; or the best bound, or None.
+        margin: Proved lower bound of the margin; that of the counterexample; or the best bound, or None.
         counterexample: Parameter values, or None.
         image: [H, W, 3] float32 picture of the counterexample, or None.
-        outputs: [n] what the network says about it, or None.
-        undecided: Whether some picture of the cell says neither that the property holds nor that it fails.
-        scene: What tells the counterexample's scene from others of the set, by name; None: only poses vary.
+        outputs: [n] of the network for it, or None.
+        undecided: Whether some picture of the cell has a margin that is not finite.
+        scene: Arrays that identify the counterexample's scene in the set, by name; None: only poses vary.
     """
 
     cell: Cell
@@ -43,9 +43,9 @@ class BlockResult:
     """The result of a block of cells.
 
     Attributes:
-        ranks: How far off a proof of each block is, about (see `Search._rank`); the nearest are best examined first.
-        samples: Whether the property was seen to hold at the middle of each cell.
-        bounded: Cells whose network bounds were computed.
+        ranks: Distance of each new block from a proof (see `Search._rank`); the nearest are examined first.
+        samples: Whether the property holds at the middle of each cell.
+        bounded: Number of cells whose network bounds were computed.
     """
 
     leaves: tuple[FinishedCell, ...]

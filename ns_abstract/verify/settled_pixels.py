@@ -1,4 +1,4 @@
-"""Pixels whose bounds over a box decide what a claim says of every picture there (docs/dev/design.md, Q5)."""
+"""Finds the pixels whose bounds over a box do not yet decide a claim (docs/dev/design.md, Q5)."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from ns_abstract.verify.picture_measures import Measure
 
 @dataclass(frozen=True)
 class SettledTuning:
-    """When a pixel's bounds are good enough. It does not decide whether a bound holds."""
+    """When a pixel's bounds are tight enough; soundness does not depend on it."""
 
     #: How far from a limit a pixel has to stay, so that margins which rest on it are not lost to rounding.
     room: float = 2.0**-8
@@ -24,7 +24,7 @@ _TUNING = SettledTuning()
 
 @dataclass(frozen=True)
 class LimitedMeasure:
-    """A measure, the first channel of its plane in pictures, and the finite limits that a claim compares it with."""
+    """A measure, the first channel of its plane in pictures, and the finite limits of the claim."""
 
     measure: Measure
     place: int
@@ -32,17 +32,17 @@ class LimitedMeasure:
 
     @property
     def counts(self) -> bool:
-        """Whether only the number of pixels beyond a limit matters, and not by how much they are."""
+        """Whether only the number of pixels beyond a limit matters, not their values."""
         measure = self.measure
         plain = measure.minus is None and measure.channels == (1.0,) and math.isinf(measure.cap)
         return measure.rank is not None and plain
 
 
 def unsettled(measures: Sequence[LimitedMeasure], lower: np.ndarray, upper: np.ndarray) -> np.ndarray:
-    """Return [H, W] bool: the pixels of which a claim needs to know more than their bounds [H, W, C] (Q5).
+    """Return [H, W] bool: the pixels whose bounds [H, W, C] do not settle what they add to a claim (Q5).
 
-    Every picture within the bounds that has the same values at these pixels has the same verdict. ``measures`` are all
-    that the claim reads.
+    All pictures within the bounds that agree at these pixels have the same verdict. ``measures`` are all that the claim
+    uses.
     """
     still_open = np.zeros(lower.shape[:2], bool)
     flat, low, high = still_open.reshape(-1), lower.reshape(-1, lower.shape[-1]), upper.reshape(-1, upper.shape[-1])

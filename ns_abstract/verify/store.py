@@ -1,10 +1,9 @@
-"""The store ``cells.sqlite`` of a search's finished cells (design.md, V8).
+"""The store ``cells.sqlite`` of a search's finished cells (docs/dev/design.md, V8).
 
-A block's findings are one transaction, which also puts its children in its place among the open blocks. So a kill loses
-at most the blocks that were being examined, and what arrives twice (a retried worker) counts once.
-
-Tables ``parameters`` and ``cells`` are for readers; ``search_*`` are the search's own. What was changed by others since
-is noticed (`TableChecksum`) and not continued.
+A block's result is one transaction, which also replaces the block by its children among the open blocks. So a kill
+loses at most the blocks under examination, and a result that arrives twice (a retried worker) counts once. Tables
+``parameters`` and ``cells`` are for readers; ``search_*`` are internal. Changes by others are detected
+(`TableChecksum`), and such a search is not continued.
 """
 
 from __future__ import annotations
@@ -32,7 +31,7 @@ _LARGEST_EVERY = 4
 
 @dataclass(frozen=True)
 class CellBlock:
-    """Cells of one frame to examine together; ``depth`` counts the cuts from the first cells."""
+    """Cells of one frame that are examined together; ``depth`` is the number of cuts since the initial cells."""
 
     number: int
     frame: int
@@ -42,13 +41,13 @@ class CellBlock:
 
 @dataclass(frozen=True)
 class Tally:
-    """Parts of a frame's parameter volume (V7); what is left is open.
+    """Volumes of a frame's parameter box by verdict (V7); the rest is open.
 
     Attributes:
-        units, certified, falsified, unknown: Volumes in grid units.
-        undecided: The part of unknown in cells with a picture that neither holds nor breaks the property.
-        poses: First cells whose middle was rendered, evenly spread over the set.
-        holding: At how many of them the property holds.
+        units, certified, falsified, unknown: Volumes in grid units; ``units`` is that of the box.
+        undecided: The unknown volume in cells with a picture whose margin is not finite.
+        poses: Initial cells whose middle was rendered, evenly spread over the set.
+        holding: Number of these at which the property holds.
     """
 
     frame: int
@@ -62,7 +61,7 @@ class Tally:
 
     @property
     def open(self) -> int:
-        """Volume without a verdict yet."""
+        """The volume without a verdict."""
         return self.units - self.certified - self.falsified - self.unknown
 
 
@@ -70,10 +69,10 @@ class Store(StoreFile):
     """An open ``cells.sqlite``.
 
     Args:
-        fingerprint: What a stored search must agree with to be continued.
+        fingerprint: A stored search must have the same one to be continued.
         parameters: Names and units of the parameters of all frames together.
         fixed: By frame, the values of parameters that do not vary in it.
-        resume: Whether to go on with what is there; otherwise it is replaced.
+        resume: Whether to continue the stored search; otherwise it is replaced.
     """
 
     def __init__(
@@ -92,18 +91,18 @@ class Store(StoreFile):
 
     @property
     def seconds(self) -> float:
-        """Time spent on the search, earlier runs included."""
+        """Seconds spent on the search, earlier runs included."""
         return self._before + time.perf_counter() - self._begun
 
     # ---------------------------------------------------------------- frames and blocks
 
     def grid(self, frame: int, box: ParameterBox) -> CellGrid | None:
-        """The grid of a frame that was begun, or None."""
+        """Return the grid of a frame that was begun, or None."""
         row = self._base.execute("SELECT units, coarse FROM search_frames WHERE frame = ?", (frame,)).fetchone()
         return None if row is None else CellGrid(box, tuple(json.loads(row[0])), tuple(json.loads(row[1])))
 
     def begin(self, frame: int, grid: CellGrid, blocks: Iterable[Sequence[Cell]]) -> None:
-        """Note a frame's first blocks, once."""
+        """Store a frame's first blocks, once."""
         box = grid.box
         with self._transaction():
             row = (
@@ -122,7 +121,7 @@ class Store(StoreFile):
             self._seals.blocks.add((self._base.execute(query, row).lastrowid, *row))
 
     def pending(self, taken: set[int], count: int) -> list[CellBlock]:
-        """Up to ``count`` open blocks that are not in ``taken``: those nearest to a proof, now and then the largest."""
+        """Return up to ``count`` open blocks not in ``taken``: those nearest to a proof, sometimes the largest."""
         blocks: list[CellBlock] = []
         for _ in range(count):
             self._turn += 1
@@ -144,11 +143,11 @@ class Store(StoreFile):
 
     @property
     def open_blocks(self) -> int:
-        """Number of blocks that are not examined yet."""
+        """Return the number of blocks that are not examined."""
         return self._base.execute("SELECT COUNT(*) FROM search_blocks").fetchone()[0]
 
     def close_block(self, block: CellBlock, findings: BlockResult, grid: CellGrid) -> bool:
-        """Store what became of a block; false, and nothing changes, if that was stored before."""
+        """Store a block's result and return True; return False, and change nothing, if it was stored before."""
         with self._transaction():
             query = f"SELECT {BLOCK} FROM search_blocks WHERE id = ?"
             gone = self._base.execute(query, (block.number,)).fetchone()
@@ -186,7 +185,7 @@ class Store(StoreFile):
         return True
 
     def _list(self, frame: int, box: ParameterBox, values: Sequence[float]) -> str:
-        """Values in the order of the table ``parameters``; 0 where this frame has none."""
+        """Return values in the order of the table ``parameters``, as JSON; 0 where this frame has none."""
         values_by_name = {**self._fixed.get(frame, {}), **dict(zip(box.names, values, strict=True))}
         return json.dumps([values_by_name.get(name, 0.0) for name in self._names])
 
@@ -209,7 +208,7 @@ class Store(StoreFile):
         self._insert("cells", row, self._seals.cells)
 
     def settled(self, kind: str, radius: float, frame: int, box: ParameterBox) -> CellOutcome | None:
-        """What `keep_settled` was told of a cell, or None."""
+        """Return the outcome that `keep_settled` stored for a cell, or None."""
         query = "kind = ? AND radius = ? AND frame = ? AND lower = ? AND upper = ?"
         row = self._base.execute(
             f"SELECT outcome, reason, slopes FROM search_settled WHERE {query}", _settled_key(kind, radius, frame, box)
@@ -217,7 +216,7 @@ class Store(StoreFile):
         return None if row is None else CellOutcome(row[0], row[1], np.array(json.loads(row[2]), np.float64))
 
     def keep_settled(self, kind: str, radius: float, frame: int, box: ParameterBox, outcome: CellOutcome) -> None:
-        """Note what is known of a cell for all scenes of a radius; scenes that break it are found again."""
+        """Store a cell's outcome for all scenes of a radius, without the arrays of scenes that break it."""
         if outcome.outcome == "falsified":
             return
         with self._transaction():
@@ -226,7 +225,7 @@ class Store(StoreFile):
             self._insert("search_settled", row, self._seals.settled)
 
     def finish(self, grids: Mapping[int, CellGrid]) -> None:
-        """List what is still open as unknown, so that the cells cover the set; `Store` takes it back on resuming."""
+        """List open cells as unknown, so that the table covers the set; `Store` reverts that on resuming."""
         with self._transaction():
             rows = []
             for block in self._listed("ORDER BY id"):
@@ -241,40 +240,40 @@ class Store(StoreFile):
     # ---------------------------------------------------------------- what was found
 
     def trace(self) -> None:
-        """Note how far the search is."""
+        """Store the present fractions as a point of the trace."""
         shares = [fractions(tally) for tally in self.tallies()]
         mean = [sum(s[key] for s in shares) / max(1, len(shares)) for key in ("certified", "falsified", "unknown")]
         self._insert("search_trace", (self.seconds, self.count, *mean), None)
 
     @property
     def points(self) -> list[dict[str, float]]:
-        """How the fractions rose over time."""
+        """Return the trace: fractions over time."""
         names = ("seconds", "cells", "certified", "falsified", "unknown")
         rows = self._base.execute("SELECT * FROM search_trace ORDER BY rowid").fetchall()
         return [dict(zip(names, row, strict=True)) for row in rows]
 
     @property
     def seal(self) -> TableChecksum:
-        """Of the rows of ``cells`` that have a verdict."""
+        """Return the checksum of the rows of ``cells`` with a verdict."""
         return self._seals.cells
 
     @property
     def count(self) -> int:
-        """Leaf cells stored."""
+        """Return the number of stored leaf cells."""
         return self._base.execute("SELECT COUNT(*) FROM cells").fetchone()[0]
 
     @property
     def effort(self) -> dict[str, float]:
-        """Cells whose network bounds were computed, and seconds that all workers together spent."""
+        """Return the number of cells with network bounds, and the seconds of all workers together."""
         return {"cells_bounded": int(self._get("bounded") or 0), "worker_seconds": float(self._get("work") or 0.0)}
 
     @property
     def reasons(self) -> dict[str, int]:
-        """Why cells are unknown, and how many of them."""
+        """Return the number of unknown cells by reason."""
         return dict(self._base.execute("SELECT reason, cells FROM search_reasons ORDER BY cells DESC, reason"))
 
     def tallies(self) -> list[Tally]:
-        """The frames that were begun, in order."""
+        """Return the tallies of the frames that were begun, in order."""
         rows = self._base.execute(
             "SELECT frame, total, certified, falsified, unknown, undecided, poses, holding FROM search_frames "
             "ORDER BY frame"
@@ -282,7 +281,7 @@ class Store(StoreFile):
         return [Tally(row[0], *map(int, row[1:])) for row in rows]
 
     def leaves(self, frame: int, verdict: Verdict | None = None) -> list[dict[str, Any]]:
-        """A frame's rows of ``cells`` in order of their lower ends, JSON read."""
+        """Return a frame's rows of ``cells`` in the order of their lower ends, with JSON parsed."""
         rows = self._base.execute(
             "SELECT lower, upper, verdict, margin, seconds, counterexample FROM cells WHERE frame = ?", (frame,)
         )
@@ -306,6 +305,6 @@ def _settled_key(kind: str, radius: float, frame: int, box: ParameterBox) -> tup
 
 
 def fractions(tally: Tally) -> dict[str, float]:
-    """Certified, falsified, unknown (examined to the finest cell) and open parts of a frame's volume."""
+    """Return certified, falsified, unknown (examined to the finest cell) and open fractions of a frame's volume."""
     names = ("certified", "falsified", "unknown", "open")
     return {name: getattr(tally, name) / tally.units for name in names}

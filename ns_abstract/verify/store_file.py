@@ -1,4 +1,4 @@
-"""The file ``cells.sqlite``: opened, checked for changes by others and sealed, and files beside it (V8)."""
+"""The file ``cells.sqlite``: opened, checked for changes by others, and sealed; and files beside it (V8)."""
 
 from __future__ import annotations
 
@@ -59,26 +59,26 @@ SETTLED = "kind, radius, frame, lower, upper, outcome, reason, slopes"
 
 @dataclass
 class TableChecksum:
-    """Number and sum of the hashes of a table's rows, in any order; it finds what was damaged or edited."""
+    """Number and sum of the hashes of a table's rows, in any order; it detects damage and edits."""
 
     rows: int = 0
     total: int = 0
 
     def add(self, row: Sequence[Any], sign: int = 1) -> None:
-        """Take in a row as the file holds it, or take it out with ``sign`` -1."""
+        """Add a row as stored in the file, or remove it with ``sign`` -1."""
         digest = hashlib.sha256(json.dumps(list(row)).encode()).digest()
         self.rows += sign
         self.total = (self.total + sign * int.from_bytes(digest, "big")) % (1 << 256)
 
     @property
     def text(self) -> str:
-        """The sum as 64 hexadecimal digits."""
+        """Return the sum as 64 hexadecimal digits."""
         return f"{self.total:064x}"
 
 
 @dataclass
 class _Checksums:
-    """Of the cells that have a verdict, the open blocks, the frames, and what is known of margins."""
+    """Checksums of cells with a verdict, of open blocks, of frames, and of scene margins."""
 
     cells: TableChecksum = field(default_factory=TableChecksum)
     blocks: TableChecksum = field(default_factory=TableChecksum)
@@ -93,7 +93,7 @@ class _Checksums:
 
 
 class StoreFile:
-    """An open ``cells.sqlite`` whose rows are those that were written.
+    """An open ``cells.sqlite`` whose rows have been checked to be those that were written.
 
     Raises:
         InputError: The folder cannot be written, or the stored search is another one or damaged.
@@ -131,7 +131,7 @@ class StoreFile:
         )
 
     def _failure(self, error: sqlite3.Error) -> InputError:
-        """What a user is told when the file cannot be read or written."""
+        """Return the error to report when the file cannot be read or written."""
         fix = "make room there and --resume, or choose a folder on another disk; finished cells are kept"
         if "locked" in str(error):
             fix = "end the program that writes to it and --resume; finished cells are kept"
@@ -139,14 +139,14 @@ class StoreFile:
 
     @contextmanager
     def errors_as_input(self) -> Iterator[None]:
-        """Errors of the file inside the block become InputError: a full disk, or a file damaged meanwhile."""
+        """Turn errors of the file inside the block into InputError: a full disk, or a file damaged meanwhile."""
         try:
             yield
         except sqlite3.Error as error:
             raise self._failure(error) from None
 
     def _open_base(self, fingerprint: Mapping[str, Any], parameters: Sequence[tuple[str, str]], resume: bool) -> bool:
-        """Open the file; whether it is a new one."""
+        """Open the file, and return whether it is a new one."""
         fresh = self._fresh = not (resume and os.path.lexists(self.file))
         report = self.folder / "report.json"
         if fresh and resume and os.path.lexists(report):
@@ -181,7 +181,7 @@ class StoreFile:
         return fresh
 
     def _create(self, fingerprint: Mapping[str, Any], parameters: Sequence[tuple[str, str]]) -> None:
-        """Write the file without cells, which is seen whole or not at all: a kill may come at any time."""
+        """Write the file without cells atomically: a kill may come at any time."""
         part = self.folder / f".{NAME}.{secrets.token_hex(4)}.part"
         try:
             self._base = sqlite3.connect(part, isolation_level=None)
@@ -200,7 +200,7 @@ class StoreFile:
             raise
 
     def _left(self) -> tuple[str]:
-        """Rows of ``cells`` that stand for open blocks, as a JSON list."""
+        """Return the rows of ``cells`` that stand for open blocks, as a JSON list."""
         return (json.dumps([int(row) for row in self._get("open_rows") or []]),)
 
     def _verify(self, parameters: Sequence[tuple[str, str]]) -> None:
@@ -235,7 +235,7 @@ class StoreFile:
         self._seals = checksums
 
     def _reported(self) -> tuple[int, str] | None:
-        """Number and sum of the cells that report.json speaks of, if it is of this search."""
+        """Return number and sum of the cells in report.json, if it is of this search; else None."""
         try:
             document = load_json(self.folder / "report.json", "report", limit=_REPORT_LIMIT)
             if document["fingerprint"] != self._get("fingerprint"):
@@ -247,7 +247,7 @@ class StoreFile:
     # ---------------------------------------------------------------- images
 
     def _remove_images(self) -> None:
-        """Remove the images that the search before has written, and none that anyone has put there or changed."""
+        """Remove the images that the earlier search wrote, and none that others added or changed."""
         if not self.file.exists():
             return
         try:
@@ -264,7 +264,7 @@ class StoreFile:
             (self.folder / IMAGES).rmdir()
 
     def _place(self, name: str) -> Path:
-        """Images of counterexamples have a folder of their own."""
+        """Return the path of a file beside the store; images of counterexamples have their own folder."""
         file = self.folder / Path(name).name
         return file.parent / IMAGES / file.name if file.suffix == ".npz" else file
 
@@ -273,7 +273,7 @@ class StoreFile:
         self.keep(f"{name}.npz", data)
 
     def keep(self, name: str, data: bytes) -> Path:
-        """Write a file and return it; one of that name that is not ours stays, and ours gets another name."""
+        """Write a file and return its path; another file of that name stays, and this one gets another name."""
         file, number = self._place(name), 1
         wanted = file
 
@@ -345,7 +345,7 @@ class StoreFile:
             raise
 
     def _insert(self, table: str, row: tuple[Any, ...], seal: TableChecksum | None) -> int:
-        """Add a row of ``table``, sealed unless it stands for an open block; returns its number."""
+        """Insert a row into ``table``, sealed unless it stands for an open block; return its number."""
         number = self._base.execute(f"INSERT INTO {table} VALUES ({', '.join('?' * len(row))})", row).lastrowid
         if seal is not None:
             seal.add(row)
@@ -360,18 +360,18 @@ class StoreFile:
 
 
 def _parts_of(base: sqlite3.Connection) -> set[tuple[str, str, str]]:
-    """Tables and indices, and what else a database defines."""
+    """Return the tables, indices and other objects that a database defines."""
     rows = base.execute("SELECT type, name, sql FROM sqlite_master WHERE sql IS NOT NULL")
     return {(kind, name, " ".join(text.split())) for kind, name, text in rows}
 
 
 def _passes(error: sqlite3.DatabaseError) -> bool:
-    """Whether the file is whole, but cannot be used now."""
+    """Return whether an error means that the file is intact but cannot be used now."""
     return isinstance(error, sqlite3.OperationalError) and any(word in str(error) for word in _PASSING)
 
 
 def _digest(file: Path) -> str | None:
-    """SHA-256 of a regular file; None of anything else."""
+    """Return the SHA-256 digest of a regular file; None for anything else."""
     if not file.is_file() or file.is_symlink():
         return None
     return hashlib.sha256(file.read_bytes()).hexdigest()

@@ -1,8 +1,8 @@
-"""Prove a cell by proving sub-boxes that cover it (docs/dev/design.md, V15).
+"""Proves a cell by proving sub-boxes that cover it (docs/dev/design.md, V15).
 
-A cell of several parameters is mostly too wide for its own linear sets, which lose by what they leave out and not by
-what the pictures do. So parts of it are bounded, slanted ones where that helps (P2); a few neighbours are joined to one
-wider set, over which the network is bounded once, and its rows serve for each of them (N15).
+A cell of several parameters is mostly too wide for its own linear sets: these lose more by linearisation than by what
+the pictures do. So sub-boxes of it are bounded, sheared ones where that helps (P2). A few neighbours are joined to one
+wider set, over which the network is bounded once; its coefficients then serve for each of them (N15).
 """
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ _POWER = 1.6
 
 @dataclass(frozen=True)
 class CoverTuning:
-    """Looks about the middle of a set. None of them decides whether a bound holds."""
+    """Preferences of the search for sub-boxes around the middle of a set; soundness does not depend on them."""
 
     #: What the mean width of pixels costs at most, however little the margin's gradient says: signs of units become
     #: open by it. Networks that bear more are told by boxes about the set's middle, of which the least is so small a
@@ -69,11 +69,11 @@ class PixelWeights:
     margin: float
 
     def cost(self, sets: PictureSets) -> float:
-        """What the sets may take from the margin, by it, to first order (V6)."""
+        """Return the loss of the margin by the sets' widths, to first order (V6)."""
         return 0.5 * float(np.abs(self.slopes * sets.widths).sum()) + float(np.abs(self._moved(sets)).sum())
 
     def loss(self, sets: PictureSets, opening: float) -> float:
-        """The same, or what their mean width alone says, which costs ``opening`` times as much."""
+        """Return that loss, or the one by the sets' mean width, times ``opening``, if that is larger."""
         return max(self.cost(sets), opening * float(sets.widths.mean()))
 
     def _moved(self, sets: PictureSets) -> np.ndarray:
@@ -81,13 +81,13 @@ class PixelWeights:
         return np.tensordot(self.slopes, middle, 3)
 
     def effects(self, sets: PictureSets) -> np.ndarray:
-        """[d] how much the pixels that matter move with each parameter."""
+        """Return the motion [d] of the pixels that matter by each parameter."""
         middle = 0.5 * (sets.linear[0].astype(np.float64) + sets.linear[2])
         return np.tensordot(np.abs(self.slopes), np.abs(middle), 3)
 
 
 def margin_weights(model: Model, claim: Claim, image: np.ndarray, values: np.ndarray) -> PixelWeights | None:
-    """Return the margin's gradient at a picture [H, W, C] of parameters ``values`` [d]; None where it is no number."""
+    """Return the margin's gradient at a picture [H, W, C] of parameters ``values`` [d]; None where it is not finite."""
     try:
         picture = torch.from_numpy(image.astype(np.float64)).requires_grad_(True)
         margin = claim.margin(model.differentiable(picture[None]), torch.from_numpy(values)[None])[0]
@@ -101,7 +101,7 @@ def margin_weights(model: Model, claim: Claim, image: np.ndarray, values: np.nda
 
 
 def pixel_costs(scene: FrameImages, model: Model, claim: Claim, box: ParameterBox) -> np.ndarray | None:
-    """What part of the margin in the middle of a cell a unit of each pixel may cost (an estimate); None: unknown."""
+    """Return the estimated fraction of the margin that a unit of each pixel's width costs; None: unknown."""
     weights = margin_weights(model, claim, scene.image(box.middle), box.middle)
     return None if weights is None or not np.isfinite(weights.slopes).all() else np.abs(weights.slopes)
 
@@ -111,8 +111,8 @@ class SubBoxOutcome:
     """The result of a cell.
 
     Attributes:
-        margin: Proven lower bound of the margin on all of it; None: there is none.
-        cuts: [d] into how many parts it should be cut along each parameter if there is none.
+        margin: Proved lower bound of the margin over all of it; None: there is none.
+        cuts: [d] number of parts to cut it into along each parameter if there is none.
     """
 
     margin: float | None
@@ -130,7 +130,7 @@ def own_parameters(box: ParameterBox) -> tuple[ParameterBox, Callable[[Parameter
 
 
 class _StoppedError(Exception):
-    """Raised when the proof of a cell is given up."""
+    """Raised to give up the proof of a cell."""
 
 
 @dataclass
@@ -138,11 +138,11 @@ class _CellWork:
     """The state of the proof of one cell.
 
     Attributes:
-        aim: What parts may cost, by what was found so far.
-        asked: Those of which the network was asked.
-        done: What part of the box is proved, or holds no pose.
+        aim: Largest cost of sub-boxes, from what was found so far.
+        asked: Number of sub-boxes that the network was bounded over.
+        done: Fraction of the box that is proved, or holds no pose.
         margins: Lower bounds of the margin over what is proved.
-        rows: Of the latest part with rows of its own, if they serve for others.
+        rows: Coefficients of the latest sub-box that has its own, if they can be reused.
     """
 
     feasible: Callable[[ParameterBox], ParameterBox | None]
@@ -156,14 +156,14 @@ class _CellWork:
     rows: ModelSharedBounds | None = None
 
     def learn(self, cost: float, margin: float) -> None:
-        """Take notice of the margin that own rows prove for a part that costs so much."""
+        """Record the margin that own coefficients prove for a sub-box of this cost."""
         left = max(margin / self.weights.margin, -1.0) - _SPARE
         self.aim = cost * (1.0 + _STEP * left)
 
 
 @dataclass(frozen=True)
 class _PendingBox:
-    """A sub-box to prove, its expected cost, and its share of the cell's box."""
+    """A sub-box to prove, its expected cost, and its fraction of the cell's box."""
 
     box: ParameterBox
     effects: np.ndarray
@@ -172,7 +172,7 @@ class _PendingBox:
     depth: int
 
     def parts(self, axis: int, count: int) -> Iterator[_PendingBox]:
-        """Equal parts along a parameter; neighbours share their ends."""
+        """Yield equal parts along a parameter; neighbours share their ends."""
         effects = self.effects.copy()
         effects[axis] /= count
         whole = float(self.effects.sum())
@@ -186,12 +186,12 @@ class SubBoxProof:
     """Proves cells of several parameters sub-box by sub-box.
 
     Args:
-        sharing: The network, as it bounds neighbours together.
-        frame: From cells to boxes of these parameters.
-        most_parts: About, of a cell; one that would take more is cut first.
-        block: Most cells that are examined together.
-        aim: What the sets of parts may cost of the margin (`PixelWeights.loss`), at first.
-        other: Another way to cover the same cells, taken where it needs fewer parts.
+        sharing: The network, with coefficients that can be reused for neighbours.
+        frame: Maps cells to boxes of these parameters.
+        most_parts: Approximate largest number of sub-boxes of a cell; one that would take more is cut first.
+        block: Largest number of cells that are examined together.
+        aim: Initial aim for the cost of sub-boxes' sets, as a fraction of the margin (`PixelWeights.loss`).
+        other: Another way to cover the same cells, taken where it needs fewer sub-boxes.
     """
 
     scene: FrameImages
@@ -205,12 +205,12 @@ class SubBoxProof:
     other: SubBoxProof | None = None
 
     def prove(self, cell: ParameterBox, outputs: np.ndarray, weights: PixelWeights) -> SubBoxOutcome:
-        """Try to prove a cell, if it takes few enough parts. ``outputs``: [n] outputs seen in it."""
+        """Try to prove a cell, if it takes few enough sub-boxes. ``outputs``: [n] of a sample in it."""
         return self._chosen._prove(cell, outputs, weights)
 
     @cached_property
     def _chosen(self) -> SubBoxProof:
-        """This way, or the other: the same wherever it is asked for (V15)."""
+        """This way or the other one: the same wherever it is evaluated (V15)."""
         return self if self.other is None or self.parts <= self.other.parts else self.other
 
     def _prove(self, cell: ParameterBox, outputs: np.ndarray, weights: PixelWeights) -> SubBoxOutcome:
@@ -234,9 +234,10 @@ class SubBoxProof:
 
     @cached_property
     def opening(self) -> float:
-        """What the mean width of pixels costs, in margins: the same wherever it is asked for (V15).
+        """The cost of pixels' mean width, in margins: the same wherever it is evaluated (V15).
 
-        Boxes about the set's middle grow until own rows leave a smaller part of its margin than they should.
+        Boxes around the set's middle grow until own coefficients leave a smaller fraction of its margin than they
+        should.
         """
         whole, most = self.scene.box, _TUNING.opening
         outputs = self.model.outputs(self.scene.image(np.array(whole.middle))[None])
@@ -256,7 +257,7 @@ class SubBoxProof:
 
     @cached_property
     def parts(self) -> float:
-        """Parts of the whole set, about, if all were as those about its middle whose mean width costs what it may."""
+        """Estimated number of sub-boxes of the whole set, if all were as wide as those around its middle may be."""
         whole = self.scene.box
         counts = np.full(whole.dimensions, float(_PROBE))
         for _ in range(_TRIALS):
@@ -276,7 +277,7 @@ class SubBoxProof:
         return picture_sets if picture_sets.sane else None
 
     def _all(self, work: _CellWork, node: _PendingBox) -> None:
-        """Prove a box, in groups of parts."""
+        """Prove a box, in groups of sub-boxes."""
         counts = divisions(node.effects, node.cost, work.aim, self.most_parts)
         if math.prod(counts) > (_GROUP if self.sharing.reusable_anywhere else _JOINED):
             for half in node.parts(int(np.argmax(counts)), 2):
@@ -288,7 +289,7 @@ class SubBoxProof:
         self._group(work, parts)
 
     def _feasible(self, work: _CellWork, nodes: Iterable[_PendingBox]) -> list[_PendingBox]:
-        """What the poses of the cell leave of them; what holds none is done with."""
+        """Return the sub-boxes, each reduced to the poses of the cell in it; those without poses are done."""
         feasible_boxes: list[_PendingBox] = []
         for node in nodes:
             box = work.feasible(node.box)
@@ -299,7 +300,7 @@ class SubBoxProof:
         return feasible_boxes
 
     def _group(self, work: _CellWork, nodes: Sequence[_PendingBox]) -> None:
-        """Prove neighbouring parts."""
+        """Prove neighbouring sub-boxes."""
         nodes = self._feasible(work, nodes)
         if not nodes:
             return
@@ -320,7 +321,7 @@ class SubBoxProof:
             self._group(work, halves[first : first + _GROUP])
 
     def _together(self, work: _CellWork, parts: Sequence[PictureSets], costs: np.ndarray) -> np.ndarray:
-        """[m] margins of parts, by as few rows as possible."""
+        """Return margins [m] of sub-boxes, with as few backward passes as possible."""
         if not self.sharing.reusable_anywhere:
             return self._joined(work, parts, costs)
         margins = np.full(len(parts), -np.inf)
@@ -344,7 +345,7 @@ class SubBoxProof:
     def _lent(
         self, work: _CellWork, rows: ModelSharedBounds, parts: Sequence[PictureSets], margins: np.ndarray
     ) -> None:
-        """Prove those of ``parts`` without a margin by rows of another, in place."""
+        """Fill in ``margins`` of sub-boxes without one, by another sub-box's coefficients."""
         for fresh in (False, True):
             # before, nothing is known of some
             near = margins >= -_NEAR * work.weights.margin if fresh else True
@@ -356,7 +357,7 @@ class SubBoxProof:
                 )
 
     def _joined(self, work: _CellWork, parts: Sequence[PictureSets], costs: np.ndarray) -> np.ndarray:
-        """[m] margins of parts, by rows of sets that hold all of them."""
+        """Return margins [m] of sub-boxes, by coefficients of sets that contain all of them."""
         whole = hull_of_sets(parts)
         rows = self.sharing.shared_bounds(self._images([whole]))
         margins = np.full(len(parts), self._proved(work.query, rows.first(work.query), [whole])[0])
@@ -365,7 +366,7 @@ class SubBoxProof:
         return margins
 
     def _bounded(self, work: _CellWork, nodes: Sequence[_PendingBox]) -> list[PictureSets]:
-        """Sets of parts. Raises _StoppedError: there are too many, or one has none."""
+        """Return sets of sub-boxes. Raises _StoppedError: there are too many, or one has none."""
         work.parts += len(nodes)
         late = work.asked > self.most_parts // 2 and work.asked > _MORE * self.most_parts * work.done
         if late or work.parts > 2.0 * _MORE * self.most_parts:
@@ -381,7 +382,7 @@ class SubBoxProof:
     def _left(
         self, work: _CellWork, nodes: Sequence[_PendingBox], margins: np.ndarray
     ) -> list[tuple[int, _PendingBox]]:
-        """Those of ``nodes`` that have no proof, by number; the others are done with."""
+        """Return the ``nodes`` without proof, with their numbers; the others are done."""
         work.margins += [float(margin) for margin in margins if margin > 0.0]
         work.done += sum(node.share for node, margin in zip(nodes, margins, strict=True) if margin > 0.0)
         left = [(k, node) for k, node in enumerate(nodes) if not margins[k] > 0.0]
@@ -395,17 +396,17 @@ class SubBoxProof:
         return self.model.input_sets(tuple(linear), lower, upper)
 
     def _proved(self, query: Query, bounds: OutputBounds, parts: Sequence[PictureSets]) -> np.ndarray:
-        """[m] margins; what is no finite number proves nothing."""
+        """Return margins [m]; NaN and infinities prove nothing."""
         margins = np.asarray(self.claim.proved(query, bounds, [sets.box for sets in parts]), np.float64)
         return np.where(np.isfinite(margins), margins, -np.inf)
 
     def _cuts(
         self, cell: ParameterBox, root: ParameterBox, effects: np.ndarray | None, cost: float, always: bool = False
     ) -> tuple[int, ...]:
-        """[d] parts of a cell, such that each takes few enough; two at least.
+        """Return numbers [d] of parts of a cell, at least two, such that each needs few enough sub-boxes.
 
-        A cut of the cell's own parameters narrows others of the slanted box, too: the cut is taken after which the
-        fewest parts are needed in all.
+        A cut of the cell's own parameters also narrows other parameters of the sheared box: the cut is chosen after
+        which the fewest sub-boxes are needed in all.
         """
         d = cell.dimensions
         width = np.array(root.upper) - np.array(root.lower)
@@ -426,7 +427,7 @@ class SubBoxProof:
         return tuple(cuts)
 
     def _parts(self, cell: ParameterBox, width: np.ndarray, effects: np.ndarray, goal: float) -> float:
-        """Halvings that a cell needs, about."""
+        """Return the estimated number of halvings that a cell needs."""
         root = self.frame(cell)[0]
         part = (np.array(root.upper) - np.array(root.lower)) / width
         return float(np.log2(np.maximum(effects * part / goal, 1.0)).sum())
@@ -442,9 +443,9 @@ def _about_middle(box: ParameterBox, share: float | np.ndarray) -> ParameterBox:
 
 
 def divisions(effects: np.ndarray, cost: float, aim: float, most_parts: int) -> list[int]:
-    """Return into how many equal parts to divide each parameter so that their sets cost ``aim`` of the margin.
+    """Return the numbers of equal parts along each parameter such that their sets cost ``aim`` of the margin.
 
-    There is no use in many more parts than ``most_parts``.
+    There are not many more parts than ``most_parts``, which would be of no use.
     """
     gains = np.where(np.isfinite(effects), effects, 0.0) + NONZERO
     goal = (aim / cost) ** (1.0 / _POWER) * float(gains.sum()) if cost > aim else math.inf

@@ -1,6 +1,7 @@
-"""Which pixels tell most about a cell, and by their channels or by differences of these (docs/dev/design.md, U8, U10).
+"""Chooses the pixels that are likely to exclude most of a cell, and whether to bound channels or their differences.
 
-All of it is a guess from a render: it decides which pixels are bounded, not what their bounds exclude.
+This is an estimate from a render: it decides which pixels are bounded, not what their bounds exclude
+(docs/dev/design.md, U8, U10).
 """
 
 from __future__ import annotations
@@ -37,18 +38,18 @@ _LITTLE_WORK, _MORE = 300_000.0, 5
 
 @dataclass(frozen=True)
 class PixelOrder:
-    """The pixels to bound of a cell, in the order of `TiledPhoto.counted` flattened.
+    """The pixels of a cell to bound, in the order of `TiledPhoto.counted` flattened.
 
     Attributes:
-        steps: [m, 2] columns and rows that the picture may have moved by.
-        missed: [m, n] whether bounds are likely to miss the photo there at each of ``n`` pixels.
-        numbers: [n] these pixels.
-        worth: [n] what else comes first: by how much bounds miss, less how loose they are.
-        work: [n] what bounds of each take, about.
-        count: So many pixels at most, or `_MORE` times as many where these look at little.
+        steps: [m, 2] columns and rows by which the picture may have moved.
+        missed: [m, n] whether bounds of each of ``n`` pixels are likely to miss the photo there.
+        numbers: [n] the pixels' numbers.
+        worth: [n] secondary order: by how much bounds miss, less how loose they are.
+        work: [n] estimated work of each pixel's bounds.
+        count: Largest number of pixels, or `_MORE` times as many where these look at few elements.
         kinds: [T, side, side] whether `CHANNELS` or `DIFFERENCES` of a pixel tell more.
-        misses: By kind, [T, side, side, 6] by how much bounds in the cell's middle are expected to miss the photo: the
-            lower ones of three values, which may lie above what the photo allows, then the upper ones.
+        misses: By kind, [T, side, side, 6] how far bounds in the cell's middle are expected to miss the photo: lower
+            bounds of three values above what the photo allows, then upper bounds below it.
     """
 
     steps: np.ndarray
@@ -61,9 +62,9 @@ class PixelOrder:
     misses: tuple[Float64Array, ...]
 
     def towards(self, moved: Float64Array) -> tuple[np.ndarray, Float64Array]:
-        """Numbers of pixels, the most telling and cheapest first, for poses that move the picture by ``moved`` [k, 2].
+        """Return pixels' numbers, the most telling and cheapest first, and the fraction that each is likely to exclude.
 
-        And the part of these poses that each is likely to exclude.
+        The fractions are of the poses that move the picture by ``moved`` [k, 2].
         """
         nearest = np.abs(moved[:, None] - self.steps).sum(axis=-1).argmin(axis=1)
         weights = np.bincount(nearest, minlength=len(self.steps)) / max(1, len(moved))
@@ -71,14 +72,14 @@ class PixelOrder:
 
     @property
     def everywhere(self) -> tuple[np.ndarray, Float64Array]:
-        """The pixels that are likely to exclude all of the cell, and 1 for each."""
+        """Return the pixels that are likely to exclude all of the cell, and 1 for each."""
         numbers, _ = self._sorted(np.where(self.missed.all(axis=0), 1.0, 0.0))
         return numbers, np.ones(numbers.size)
 
     def telling(self, pixels: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """[n, 6] the bounds of the ``n`` ``pixels`` [T, side, side] that are expected to miss the photo most.
+        """Return [n, 6] the bounds of the ``n`` ``pixels`` [T, side, side] that are expected to miss the photo most.
 
-        And [n] whether they are of `DIFFERENCES`.
+        The second result [n] is whether they are of `DIFFERENCES`.
         """
         kinds = self.kinds[pixels]
         misses = np.choose(kinds[:, None], [miss[pixels] for miss in self.misses])
@@ -95,13 +96,12 @@ class PixelOrder:
 
 @dataclass(frozen=True)
 class TypicalCell:
-    """What bounds over a cell, or its parts, lose.
+    """The losses of bounds over a cell, or its parts.
 
     Attributes:
         picture: [H, W, 3] in its middle.
-        width: Pixels by which bounds over it are wide.
-        losses: By kind, [H, W, 3] by how much bounds go below, and above, what is rendered nearby. There are those of
-            `CHANNELS` alone, or both.
+        width: Pixels of image motion by which bounds over it are wide.
+        losses: By kind, [H, W, 3] how far bounds lie below, and above, renders nearby; of `CHANNELS`, or of both kinds.
     """
 
     picture: np.ndarray
@@ -110,7 +110,7 @@ class TypicalCell:
 
 
 class TellingPixels:
-    """Chooses pixels of a photo, by what bounds over a typical cell lose at the same content.
+    """Chooses pixels of a photo, by the losses of bounds over a typical cell at the same content.
 
     Args:
         photo: In tiles.
@@ -127,11 +127,11 @@ class TellingPixels:
         self, tiles: np.ndarray, radius: int, width: float, counted: np.ndarray, count: int,
         elements: np.ndarray | None,
     ) -> PixelOrder:  # fmt: skip
-        """The pixels to bound of a cell whose middle shows ``tiles``.
+        """Return the pixels to bound of a cell whose middle shows ``tiles``.
 
         Args:
-            radius: Pixels that the picture moves by over half of the cell.
-            width: Pixels by which bounds over it are wide.
+            radius: Pixels by which the picture moves over half of the cell.
+            width: Pixels of image motion by which bounds over it are wide.
             counted: [T, side, side] pixels that may be chosen.
             count: See `PixelOrder`.
             elements: [H, W] scene elements that each pixel's bounds look at, where these are over parts of the cell and
@@ -160,7 +160,7 @@ class TellingPixels:
         return PixelOrder(steps, missed > 0.0, np.flatnonzero(counted), worth, work, count, chosen, misses)
 
     def _moved_misses(self, kind: int, ends: tuple[Float64Array, Float64Array], steps: np.ndarray) -> np.ndarray:
-        """[m, T, side, side] by how much bounds ``ends`` miss the photo where the picture moved by ``steps``."""
+        """Return how far bounds ``ends`` miss the photo where the picture moved by ``steps``, [m, T, side, side]."""
         low, high = self.ends[kind]
         misses = []
         for column, row in steps.tolist():
@@ -169,7 +169,7 @@ class TellingPixels:
         return np.stack(misses)
 
     def _misses(self, kind: int, ends: tuple[Float64Array, Float64Array]) -> Float64Array:
-        """See `PixelOrder`: by how much bounds ``ends`` miss the photo."""
+        """Return how far bounds ``ends`` miss the photo; see `PixelOrder`."""
         low, high = self.ends[kind]
         return in_tiles(np.concatenate([ends[0] - high, low - ends[1]], axis=-1), self.side)
 
@@ -177,11 +177,11 @@ class TellingPixels:
 def typical_cell(
     frame: Frame, cell: ParameterBox, parts: MotionCells | np.ndarray | None, width: float, picture: np.ndarray
 ) -> TypicalCell:
-    """What bounds over the parts in the middle of a cell lose.
+    """Return the losses of bounds over the parts in the middle of a cell.
 
     Args:
         parts: Its motion cells, or numbers [d] of sub-boxes; None: it is bounded as a whole.
-        width: Pixels by which bounds over it are wide.
+        width: Pixels of image motion by which bounds over it are wide.
         picture: [H, W, 3] in its middle.
     """
     camera = frame.camera
@@ -202,7 +202,7 @@ def typical_cell(
 def _bounds_in_the_middle(
     frame: Frame, cell: ParameterBox, parts: MotionCells | np.ndarray | None, pixels: np.ndarray
 ) -> list[tuple[np.ndarray, np.ndarray]]:
-    """By kind, bounds [n, 3] of the ``n`` ``pixels`` over the middle of a cell."""
+    """Return by kind bounds [n, 3] of the ``n`` ``pixels`` over the middle of a cell."""
     tiles = np.flatnonzero(pixels.any(axis=(1, 2)))
     if parts is None:
         whole = frame.bound(cell, tiles, None)
@@ -222,7 +222,7 @@ def _bounds_in_the_middle(
 
 
 def _lattice(shape: tuple[int, int], step: int) -> np.ndarray:
-    """[H, W] every so many pixels, from the middle of the first ones on."""
+    """Return [H, W] a lattice of pixels ``step`` apart."""
     pixels = np.zeros(shape, bool)
     pixels[step // 2 :: step, step // 2 :: step] = True
     return pixels
@@ -231,7 +231,7 @@ def _lattice(shape: tuple[int, int], step: int) -> np.ndarray:
 def _losses(
     values: np.ndarray, motion: float, lower: np.ndarray, upper: np.ndarray, pixels: np.ndarray, camera: PinholeCamera
 ) -> list[Float64Array]:
-    """By how much bounds [n, 3] of ``n`` pixels go below and above ``values`` [H, W, 3] nearby; NaN elsewhere."""
+    """Return how far bounds [n, 3] of ``n`` pixels lie below and above ``values`` [H, W, 3] nearby; NaN elsewhere."""
     least, most = (in_tiles(end, pixels.shape[1])[pixels] for end in nearby(values, max(1, round(0.5 * motion))))
     losses = []
     for gap in (least - lower, upper - most):
@@ -242,24 +242,24 @@ def _losses(
 
 
 def _values(picture: np.ndarray, kind: int) -> np.ndarray:
-    """What is bounded of a picture [H, W, 3]."""
+    """Return the bounded values of a picture [H, W, 3]: channels or their differences."""
     if kind == CHANNELS:
         return picture
     return picture[..., FIRST_CHANNELS] - picture[..., SECOND_CHANNELS]
 
 
 def _ends(picture: np.ndarray, kind: int, losses: Sequence[Float64Array]) -> tuple[Float64Array, Float64Array]:
-    """Bounds [H, W, 3] that are expected of a picture: what it shows next to each pixel, and what they lose."""
+    """Return expected bounds [H, W, 3] of a picture: its extremes around each pixel, widened by the losses."""
     least, most = nearby(_values(picture, kind), 1)
     return least - losses[0], most + losses[1]
 
 
 def _likely(shares: Float64Array, worth: Float64Array) -> Float64Array:
-    """The part of a cell that each pixel is likely to exclude, of the ``shares`` where bounds may miss the photo."""
+    """Return the fraction of a cell that each pixel is likely to exclude, of ``shares`` where bounds may miss."""
     # what bounds lose has no end where a cell is far wider than the typical one
     return shares / (1.0 + np.exp(np.minimum((_EVEN - worth) / _STEEP, _HOPELESS)))
 
 
 def _steps(radius: int) -> range:
-    """Pixels that a picture may move by along an axis, two apart."""
+    """Return pixels by which a picture may move along an axis, two apart."""
     return range(1 - radius, radius, 2) if radius > 1 else range(1)

@@ -1,11 +1,9 @@
-"""Read VNN-LIB files (versions 1 and 2): sets of unsafe outputs, and boxes of inputs.
+"""Reads VNN-LIB files (versions 1 and 2): sets of unsafe outputs, and boxes of inputs.
 
-Only what the format's users write is read: ``declare-const`` (of version 2: `ns_abstract.verify.vnnlib2`), and
-``assert`` of ``<=``, ``>=``, ``and``, ``or`` over bounds of single inputs and linear expressions of the outputs. In
-certificates of scenes the images take the place of the inputs' bounds.
-
-No overflow may become a verdict: numbers that overflow or vanish on the way are refused, and constraints with huge or
-tiny factors are multiplied by powers of two.
+It reads ``declare-const`` (of version 2: `ns_abstract.verify.vnnlib2`), and ``assert`` of ``<=``, ``>=``, ``and``,
+``or`` over bounds of single inputs and linear expressions of the outputs. In certificates of scenes the images take the
+place of the inputs' bounds. No overflow may become a verdict: numbers that overflow or vanish on the way are refused,
+and constraints with huge or tiny factors are multiplied by powers of two.
 """
 
 from __future__ import annotations
@@ -53,9 +51,9 @@ _Linear = tuple[dict[int, float], float]
 
 @dataclass(frozen=True)
 class _Run:
-    """Bounds of single inputs, all of which hold: one text each, without the closing bracket.
+    """A conjunction of bounds of single inputs: one text each, without the closing bracket.
 
-    ``limits``, shared by all runs: the side (0 below, 1 above), the input and the limit of a text.
+    ``limits``, shared by all runs: by text, the side (0 below, 1 above), the input and the limit.
     """
 
     texts: list[str]
@@ -65,7 +63,7 @@ class _Run:
         return " ".join(f"{text})" for text in self.texts)
 
     def read(self, declared: set[str], size: _VariableCounts) -> None:
-        """Learn what the texts say."""
+        """Parse the texts into ``limits``."""
         for text in set(self.texts).difference(self.limits):
             ((constraint,),) = _ways(_expressions(text + ")")[0], declared, size)
             assert not isinstance(constraint, _Run)
@@ -75,7 +73,7 @@ class _Run:
             self.limits[text] = int(side), int(index), float(ends[side, index])
 
     def limit(self, ends: np.ndarray) -> None:
-        """Make ``ends`` [2, n] obey them."""
+        """Narrow ``ends`` [2, n] by the bounds."""
         side, index, value = (np.array(v) for v in zip(*map(self.limits.__getitem__, self.texts), strict=True))
         np.maximum.at(ends[0], index[side == 0], value[side == 0])
         np.minimum.at(ends[1], index[side == 1], value[side == 1])
@@ -86,7 +84,7 @@ _Conjunction = list[_Linear | _Run]
 
 
 class _VariableCounts(NamedTuple):
-    """Numbers of inputs and outputs; inputs may be None where no assertion is to name them."""
+    """Numbers of inputs and outputs; inputs may be None where no assertion may name them."""
 
     inputs: int | None
     outputs: int
@@ -101,7 +99,7 @@ def _size(shape: Shape) -> int:
 
 
 def load_vnnlib(path: Path, output_shape: Shape, input_shape: Shape | None = None) -> UnsafeSet:
-    """Read a VNN-LIB file, packed (.gz) or not, for a network of these shapes.
+    """Return the unsafe set of a VNN-LIB file, packed (.gz) or not, for a network of these shapes.
 
     As many outputs must be declared, and as many inputs or none; ``input_shape`` None: inputs are not compared.
     """
@@ -117,7 +115,7 @@ def load_vnnlib(path: Path, output_shape: Shape, input_shape: Shape | None = Non
 def _read(
     text: str, input_shape: Shape | None, output_shape: Shape, runs: bool = False
 ) -> tuple[list[Any], Vnnlib2Query | None]:
-    """The expressions of version 1 that a file means, and the query that a file of version 2 is.
+    """Return a file's expressions as those of version 1, and the query of a file of version 2, or None.
 
     ``runs``: whether bounds of single inputs may be a `_Run`.
     """
@@ -139,7 +137,7 @@ def _text(path: Path) -> str:
 
 
 def _check_declared(declared: set[str], kind: str, count: int) -> None:
-    """Refuse a file that was written for a network of another size."""
+    """Raise InputError for a file that was written for a network of another size."""
     names = {name for name in declared if name[0] == kind}
     if names != {f"{kind}_{k}" for k in range(count)}:
         what = "inputs" if kind == "X" else "outputs"
@@ -153,10 +151,10 @@ def _check_declared(declared: set[str], kind: str, count: int) -> None:
 def load_query(
     path: Path, input_shape: Shape, output_shape: Shape, text: str | None = None
 ) -> tuple[tuple[InputRegion, ...], Vnnlib2Query | None]:
-    """Read a VNN-LIB file with its inputs: the property is violated if some region has an input with an unsafe output.
+    """Return the regions of a VNN-LIB file with its inputs, and the query of a file of version 2, or None.
 
-    Returns the regions, and the query that a file of version 2 is; None for version 1. ``path`` is only named in errors
-    if ``text`` is given.
+    The property is violated if some region has an input with an unsafe output. ``path`` is only named in errors if
+    ``text`` is given.
     """
     text = _text(path) if text is None else text
     try:
@@ -203,7 +201,7 @@ def _regions(expressions: list[Any], sizes: _VariableCounts) -> tuple[InputRegio
 
 
 def _bound(constraint: _Linear | _Run, ends: np.ndarray) -> bool:
-    """Whether ``constraint`` is one on an input, which ``ends`` [2, n] obey then; InputError: it joins several."""
+    """Narrow ``ends`` [2, n] and return True if ``constraint`` bounds one input; InputError: it joins several."""
     if isinstance(constraint, _Run):
         constraint.limit(ends)
         return True
@@ -225,7 +223,7 @@ def _bound(constraint: _Linear | _Run, ends: np.ndarray) -> bool:
 
 
 def _declares(expression: Any, declared: set[str]) -> bool:
-    """Whether an expression declares a variable; if not, it is an assertion, or InputError is raised."""
+    """Return whether an expression declares a variable; else it is an assertion, or InputError is raised."""
     head = expression[0] if isinstance(expression, list) and expression else None
     if head == "declare-const" and len(expression) == 3:
         _, name, kind = expression
@@ -239,7 +237,7 @@ def _declares(expression: Any, declared: set[str]) -> bool:
 
 
 def _expressions(text: str, runs: bool = False) -> list[Any]:
-    """Nested lists of tokens; ``runs``: and of `_Run` inside of conjunctions."""
+    """Return nested lists of tokens; with ``runs`` also `_Run` inside of conjunctions."""
     stack: list[list[Any]] = [[]]
     places: dict[str, tuple[int, int, float]] = {}
     at, number = 0, 0
@@ -321,10 +319,10 @@ def _unsafe(conjunctions: list[_Conjunction], output_size: int, inputs: int) -> 
 
 
 def _scaled(coefficients: dict[int, float], constant: float, size: int) -> tuple[np.ndarray, float]:
-    """A constraint as a row and an offset, multiplied by a power of two where its factors are huge or tiny.
+    """Return a constraint as a row and an offset, multiplied by a power of two where factors are huge or tiny.
 
     Raises:
-        InputError: Its numbers are too far apart for arithmetic that says which side of it an output is on.
+        InputError: Its numbers are too far apart for arithmetic that decides on which side an output lies.
     """
     row = np.zeros(size)
     for index, value in coefficients.items():
@@ -347,14 +345,14 @@ def _scaled(coefficients: dict[int, float], constant: float, size: int) -> tuple
 
 
 def _names(expression: Any) -> set[str]:
-    """Variables of an expression."""
+    """Return the variables of an expression."""
     if isinstance(expression, list):
         return {name for part in expression for name in _names(part)}
     return {expression} if _VARIABLE.fullmatch(expression) else set()
 
 
 def _ways(expression: Any, declared: set[str], size: _VariableCounts) -> list[_Conjunction]:
-    """The expression as a disjunction of conjunctions."""
+    """Return the expression as a disjunction of conjunctions."""
     head = expression[0] if isinstance(expression, list) and expression else None
     if head == "or" and len(expression) > 1:
         return [way for part in expression[1:] for way in _ways(part, declared, size)]

@@ -45,7 +45,7 @@ class Tensor:
         return math.prod(self.shape)
 
     def assignment(self, values: np.ndarray) -> str:
-        """The lines of the standard's command-line format for ``values`` [size], in rows."""
+        """Return ``values`` [size], in rows, in the standard's command-line format."""
         numbers = values.astype(np.float32).astype(np.float64) if self.kind == "float32" else values
         lines = [f"{self.name} {self.kind} [{','.join(map(str, self.shape))}]", *map(repr, numbers.tolist())]
         return "\n".join(lines) + "\n"
@@ -53,7 +53,7 @@ class Tensor:
 
 @dataclass(frozen=True)
 class Vnnlib2Query:
-    """A query as declarations and assertions of version 1 about ``X_0, ...`` and ``Y_0, ...``, elements in rows."""
+    """A query as declarations and assertions of version 1 about ``X_0, ...`` and ``Y_0, ...``, tensors in row order."""
 
     network: str
     input: Tensor
@@ -62,12 +62,12 @@ class Vnnlib2Query:
 
 
 def is_version_2(text: str) -> bool:
-    """Whether a file says that it is of version 2 or later; files of version 1 say nothing."""
+    """Return whether a file says that it is of version 2 or later; files of version 1 do not say."""
     return _HEADER.match(text) is not None
 
 
 def joined(text: str) -> str:
-    """The text with every element ``X [0, 1]`` as one token ``X[0,1]``, without comments.
+    """Return the text with every element ``X [0, 1]`` as one token ``X[0,1]``, without comments.
 
     Raises:
         InputError: It names nodes by strings, or holds a zero byte, behind which some programs read nothing.
@@ -84,9 +84,9 @@ def joined(text: str) -> str:
 def parse_query(
     expressions: list[Any], input_shape: Sequence[int] | int | None, output_shape: Sequence[int] | int
 ) -> Vnnlib2Query:
-    """Return the query that the nested tokens of a file's `joined` text are.
+    """Return the query in the nested tokens of a file's `joined` text.
 
-    Shapes are of the network, without the batch; a number: of the elements alone; None: not compared.
+    Shapes are of the network, without the batch; a number: of elements alone; None: not compared.
     """
     if len(expressions) < 2 or not isinstance(expressions[0], list) or len(expressions[0]) != 2:
         raise InputError("no (vnnlib-version <2.0>) and network", fix="write (vnnlib-version <2.0>) first")
@@ -157,7 +157,7 @@ def _indices(text: str, name: str) -> tuple[int, ...]:
 
 
 def _check_shape(tensor: Tensor, shape: Sequence[int] | int, what: str) -> None:
-    """Refuse a tensor of another shape than the network's; sides of 1 do not count."""
+    """Raise InputError for a tensor of another shape than the network's; sides of 1 do not count."""
     if isinstance(shape, int):
         good = tensor.size == shape
     else:
@@ -169,7 +169,7 @@ def _check_shape(tensor: Tensor, shape: Sequence[int] | int, what: str) -> None:
 
 
 class _Reader:
-    """Turns conditions into those of version 1."""
+    """Translates conditions to version 1."""
 
     def __init__(self, tensors: dict[str, tuple[str, Tensor]], kind: str) -> None:
         self.tensors, self.kind = tensors, kind
@@ -187,7 +187,7 @@ class _Reader:
         return parts[0] if len(parts) == 1 else ["and", *parts]
 
     def _side(self, expression: list[Any], head: str, operator: str) -> list[Any]:
-        """One closed comparison; float32 numbers are moved outward to their float32 values where these are further."""
+        """Return one closed comparison; a float32 number is moved outward to its float32 value if that is further."""
         left, right = expression[1], expression[2]
         if self.kind == "real":
             return [operator, self.term(left), self.term(right)]
@@ -235,7 +235,7 @@ class _Reader:
 
 
 def _literal(expression: Any) -> float | None:
-    """The value of a number, or of the negative of one; None for anything else."""
+    """Return the value of a number, or of the negative of one; None for anything else."""
     negative = isinstance(expression, list) and len(expression) == 2 and expression[0] == "-"
     text = expression[1] if negative else expression
     if not isinstance(text, str) or not _NUMBER.fullmatch(text):
@@ -245,7 +245,7 @@ def _literal(expression: Any) -> float | None:
 
 
 def _outward(value: float, larger: bool) -> str:
-    """The number or its float32 value, whichever is the larger (or the smaller) one."""
+    """Return the larger (or the smaller) of a number and its float32 value, as text."""
     with np.errstate(over="ignore"):
         single = float(np.float32(value))
     if not math.isfinite(single):
@@ -254,18 +254,18 @@ def _outward(value: float, larger: bool) -> str:
 
 
 def source_text(expression: Any) -> str:
-    """An expression for messages, cut off where it is long."""
+    """Return an expression as text for messages, cut off where it is long."""
     text = f"({' '.join(map(source_text, expression))})" if isinstance(expression, list) else str(expression)
     return text if len(text) <= 60 else f"{text[:57]}..."
 
 
 def refused(expression: Any, fix: str) -> InputError:
-    """The error of an expression."""
+    """Return the error for an expression."""
     return InputError(f"not understood: {source_text(expression)}", fix=fix)
 
 
 def write_query(d: int, n: int, groups: Sequence[Sequence[int]], k: int, notes: Sequence[str] = ()) -> str:
-    """The query of ``d`` parameters and ``n`` slacks in [-1, 1], violated where a group of outputs is <= 0."""
+    """Return the query of ``d`` parameters and ``n`` slacks in [-1, 1], violated where a group of outputs is <= 0."""
     lines = ["(vnnlib-version <2.0>)", *(f"; {note}" for note in notes)]
     lines += [f"(declare-network f (declare-input X float32 [1,{d + n}]) (declare-output Y float32 [1,{k}]))"]
     lines += violation("X[0,{}]", "Y[0,{}]", d + n, groups)
@@ -273,7 +273,7 @@ def write_query(d: int, n: int, groups: Sequence[Sequence[int]], k: int, notes: 
 
 
 def violation(source: str, result: str, count: int, groups: Sequence[Sequence[int]]) -> list[str]:
-    """The assertions that ``count`` inputs lie in [-1, 1] and that a group of outputs is <= 0, in either version.
+    """Return the assertions that ``count`` inputs lie in [-1, 1] and a group of outputs is <= 0, in either version.
 
     ``source`` and ``result`` are names of an input and of an output, with {} for the number.
     """

@@ -1,4 +1,4 @@
-"""What a VNN-LIB file asks: unsafe sets of outputs, and regions of inputs."""
+"""The content of a VNN-LIB file: unsafe sets of outputs, and regions of inputs."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ import numpy as np
 class UnsafeSet:
     """Outputs y are unsafe if ``rows[g] @ y + offset[g] <= 0`` holds for every row of some group g.
 
-    ``inputs`` is the number of assertions on inputs that were set aside.
+    ``inputs`` is the number of assertions on inputs that are ignored.
     """
 
     rows: np.ndarray
@@ -29,6 +29,6 @@ class InputRegion:
     unsafe: UnsafeSet
 
     def holds(self, output: np.ndarray) -> bool:
-        """Whether ``output`` is unsafe."""
+        """Return whether ``output`` is unsafe."""
         value = self.unsafe.rows @ output + self.unsafe.offset
         return any(bool((value[list(group)] <= 0.0).all()) for group in self.unsafe.groups)

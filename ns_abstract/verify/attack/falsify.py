@@ -1,9 +1,8 @@
-"""Attack an abstract image: search its set of poses for a rendered image outside its bounds, at tolerance zero.
+"""Attacks an abstract image: searches its set of poses for a rendered image outside its bounds, at tolerance zero.
 
-What the attack returns is a lower bound of what is wrong. The poses tried are given ones, the middle and corners of the
-box, random ones, and two searches that look where an image comes closest to a bound relative to the gap: projected
-gradient ascent through a differentiable twin of the renderer, and bisection towards jumps, whose two sides are
-rendered.
+The result is a lower bound of the violation. The poses tried are given ones, the middle and corners of the box, random
+ones, and two searches where an image comes closest to a bound relative to the gap: projected gradient ascent through a
+differentiable twin of the renderer, and bisection towards jumps, whose two sides are rendered.
 """
 
 from __future__ import annotations
@@ -38,7 +37,7 @@ _HALVINGS = 60
 
 @dataclass(frozen=True)
 class SuspectTuning:
-    """When an attack takes a function for one that jumps; what it reports is rendered again."""
+    """When an attack assumes that a function jumps; whatever it reports is rendered again."""
 
     #: A continuous function falls by about 2^-16 in so many halvings; what falls less than this jumps.
     suspect_halvings: int = 16
@@ -111,7 +110,7 @@ class _ImageExtremes:
         return image
 
     def image_once(self, values: Float64Array, strategy: str) -> None:
-        """Render and compare one pose, unless that was done before."""
+        """Render and compare one pose, unless that has been done."""
         if values.tobytes() not in self.seen:
             self.image(values, strategy)
 
@@ -123,7 +122,7 @@ class _ImageExtremes:
         upper: Float64Array,
         pixels: NDArray[np.int64] | None,
     ) -> None:
-        """Compare [..., 3] values with their bounds; ``pixels`` [k, 2] names them where it is no whole image."""
+        """Compare values [..., 3] with their bounds; ``pixels`` [k, 2] names them if they are no whole image."""
         self.comparisons += image.size
         self.not_finite += int((~np.isfinite(image)).sum())
         inside = (lower <= image) & (image <= upper)
@@ -146,7 +145,7 @@ class _ImageExtremes:
             self._keep(Violation(tuple(values.tolist()), *where, *values_at))
 
     def pixel(self, probe: RenderPixels | None, values: Float64Array, target: _Target) -> float:
-        """The target's value at a pose, compared with its bounds; rendered in full if there is no probe."""
+        """Return the target's value at a pose, compared with its bounds; without a probe the image is rendered."""
         if probe is None:
             return float(self.image(values, "jumps")[target.row, target.column, target.channel])
         if time.perf_counter() >= self.deadline:
@@ -159,7 +158,7 @@ class _ImageExtremes:
         return float(color[0, target.channel])
 
     def _ranking(self) -> NDArray[np.int64]:
-        """Flat indices into [2, H, W, 3] (upper, lower bound) of what came closest to its bound relative to the gap."""
+        """Return flat indices into [2, H, W, 3] (upper, lower bound), the relatively closest to its bound first."""
         gap = self.upper - self.lower
         with np.errstate(divide="ignore", invalid="ignore"):
             score = np.stack([(self.most - self.lower) / gap, (self.upper - self.least) / gap])
@@ -177,10 +176,10 @@ class _ImageExtremes:
         return _Target(row, column, channel, 1.0 if side == 0 else -1.0, self.poses[number])
 
     def targets(self, count: int, generator: np.random.Generator, done: set[int]) -> list[_Target]:
-        """Pixel channels to push, none of them in ``done``, to which they are added.
+        """Return pixel channels to push that are not in ``done``, to which they are added.
 
-        A third each: what came closest to a bound; the closest whose extreme pose is no corner of the
-        box (at a corner there is rarely further to go); any of the closest half.
+        A third each: the closest to a bound; the closest whose extreme pose is no corner of the box (at a corner there
+        is rarely further to go); any of the closest half.
         """
         order = self._ranking()
         if done:
@@ -198,7 +197,7 @@ class _ImageExtremes:
         return [self._target(flat) for flat in best]
 
     def closest(self) -> Float64Array:
-        """[n, d] poses of the closest approaches, each once."""
+        """Return poses [n, d] of the closest approaches, each once."""
         order = self._ranking()
         poses = [self._target(flat).pose for flat in order[:256]]
         unique = list(dict.fromkeys(tuple(pose.tolist()) for pose in poses))[:8]
@@ -235,7 +234,7 @@ class _Target:
 
 
 def _corners(box: ParameterBox, count: int, generator: np.random.Generator) -> Float64Array:
-    """[n, d] all corners, or ``count`` different ones drawn at random."""
+    """Return all corners [n, d], or ``count`` different ones drawn at random."""
     if box.dimensions == 0:
         return np.zeros((0, 0))
     count = min(count, _CORNERS)
@@ -247,7 +246,7 @@ def _corners(box: ParameterBox, count: int, generator: np.random.Generator) -> F
 
 
 def _ascend(record: _ImageExtremes, twin: DifferentiableRender, target: _Target, start: Float64Array) -> Float64Array:
-    """The pose that projected gradient ascent of one pixel channel ends at."""
+    """Return the final pose of projected gradient ascent of one pixel channel."""
     pixel = torch.tensor([[target.row, target.column]])
 
     def value(values: torch.Tensor) -> torch.Tensor:
@@ -259,7 +258,7 @@ def _ascend(record: _ImageExtremes, twin: DifferentiableRender, target: _Target,
 
 
 def _jump(record: _ImageExtremes, probe: RenderPixels | None, target: _Target, generator: np.random.Generator) -> None:
-    """Look for a jump of the target on a random line through its pose, and render both sides of it."""
+    """Search for a jump of the target on a random line through its pose, and render both sides of it."""
     low, high = np.array(record.box.lower), np.array(record.box.upper)
     direction = generator.normal(size=low.size) * (high - low)
     # the line's ends in the box
@@ -310,16 +309,16 @@ def falsify(
     starts: ArrayLike | None = None,
     strategies: Sequence[str] = STRATEGIES,
 ) -> Attack:
-    """Attack the abstract image [lower, upper] [H, W, 3] of the poses of ``box``.
+    """Return the result of attacking the abstract image [lower, upper] [H, W, 3] of the poses of ``box``.
 
     Args:
         lower, upper, box: See above.
-        render: Parameter values [d] to an image [H, W, 3], which must lie inside.
-        twin: Differentiable with respect to the values; it guides the ascent. Without it there is none.
+        render: Maps parameter values [d] to an image [H, W, 3], which must lie inside.
+        twin: The same, differentiable; it guides the ascent. Without it there is none.
         probe: The value of single pixels, equal to ``render``'s; saves rendering whole images.
-        poses: Most images rendered.
+        poses: Largest number of rendered images.
         seconds: Most time spent; a limit makes the outcome depend on the machine.
-        seed: Of what is random.
+        seed: Of the random choices.
         starts: [n, d] poses to try first, clipped into the box.
         strategies: Which of `STRATEGIES` to use. Poses that one does not need go to the next.
     """

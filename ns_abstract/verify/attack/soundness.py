@@ -21,7 +21,7 @@ from ns_abstract.verify.attack.falsify import DifferentiableRender, Render, Rend
 
 
 def compiled_renderer(scene: SplatScene, pose_set: PoseBox, rasteriser: Rasteriser) -> tuple[Render, RenderPixels]:
-    """The compiled renderer of the set's camera, for `falsify`: whole images, and single pixels."""
+    """Return the compiled renderer of the set's camera, for `falsify`: whole images, and single pixels."""
     renderer = Renderer(activate(scene, rasteriser), rasteriser)
     camera, side = pose_set.camera, rasteriser.work_tile
     across, _ = tile_grid(camera, side)
@@ -41,7 +41,7 @@ def compiled_renderer(scene: SplatScene, pose_set: PoseBox, rasteriser: Rasteris
 def reference_renderer(
     scene: SplatScene, pose_set: PoseBox, rasteriser: Rasteriser, dtype: torch.dtype = torch.float64
 ) -> tuple[Render, RenderPixels, DifferentiableRender]:
-    """The reference renderer of the set's camera, for `falsify`: images, single pixels, and the twin."""
+    """Return the reference renderer of the set's camera, for `falsify`: images, single pixels, and the twin."""
     reference = Reference(scene, rasteriser, dtype)
     camera, pose = pose_set.camera, differentiable_pose(pose_set)
 
@@ -62,7 +62,7 @@ def reference_renderer(
 def nerf_renderer(
     scene: NerfScene, pose_set: PoseBox, sampling: Sampling
 ) -> tuple[Render, RenderPixels, DifferentiableRender]:
-    """The renderer of a NeRF at the set's camera, for `falsify`: images, single pixels, and the twin."""
+    """Return the renderer of a NeRF at the set's camera, for `falsify`: images, single pixels, and the twin."""
     renderer = NerfRenderer(scene, sampling)
     camera, pose = pose_set.camera, differentiable_pose(pose_set)
 

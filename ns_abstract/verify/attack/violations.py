@@ -1,4 +1,4 @@
-"""What an attack on bounds found: violations, and several attacks together."""
+"""Results of attacks on bounds: violations, and several attacks merged."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ class Violation:
     """One value outside its bounds, at the parameters ``values`` in the box's order and units.
 
     Attributes:
-        bound: The bound it breaks: the lower one if ``value`` is less, else the upper one.
+        bound: The violated bound: the lower one if ``value`` is less, else the upper one.
         amount: Their distance; NaN where one is not a number.
     """
 
@@ -36,9 +36,10 @@ class Attack:
     """The result of an attack: violations, the closest approach, and the work that was done.
 
     Attributes:
-        poses, probes: Images rendered in full, and single pixels besides.
-        comparisons, violations: Pixel channels compared with their bounds; those that failed, with bounds not finite.
-        not_finite: Of those, the values and bounds that are not finite numbers.
+        poses, probes: Numbers of images rendered in full, and of further single pixels.
+        comparisons, violations: Pixel channels compared with their bounds; those that failed, or whose bounds are not
+            finite.
+        not_finite: Values and bounds among these that are not finite.
         worst: The worst violation of at most 16 pixel channels, largest first, NaN before all.
         witness_lower, witness_upper: [H, W, 3] least and largest values rendered; NaN where every image was NaN.
         tried: Poses by strategy.
@@ -60,7 +61,7 @@ class Attack:
 
     @property
     def amount(self) -> float:
-        """How far the worst value lies outside: 0 if nothing does, infinity if something is no number."""
+        """Largest distance of a value outside: 0 if all are inside, infinity if something is not a number."""
         if not self.worst:
             return 0.0
         return float("inf") if np.isnan(self.worst[0].amount) else self.worst[0].amount
