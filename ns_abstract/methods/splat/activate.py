@@ -68,10 +68,10 @@ def used_degree(scene: SplatScene, rasteriser: Rasteriser) -> int:
 
 
 def activate(scene: SplatScene, rasteriser: Rasteriser, every_band: bool = False) -> Splats:
-    """Apply Splatfacto's activations (splatfacto.py:590-606) in float64.
+    """Return the activated Gaussians by Splatfacto's formulas (splatfacto.py:590-606), in float64.
 
     Args:
-        every_band: Keep the harmonics that are zero for every Gaussian, too.
+        every_band: Whether to keep harmonics that are zero for every Gaussian.
     """
     axes = rotation_matrices(scene.quats.astype(np.float64)) * np.exp(scene.log_scales.astype(np.float64))[:, None]
     logits = scene.opacity_logits.astype(np.float64)

@@ -24,13 +24,13 @@ _FIT_LIMIT = 2.0
 
 
 class Limits(NamedTuple):
-    """What turns an exponent into alpha.
+    """The quantities that turn a Gaussian's exponent into alpha.
 
     Attributes:
-        opacity_low, opacity_high: Of the Gaussian.
-        kappa: Relative error of the exponent as it is computed.
-        sigma_max: Exponent from which on alpha is below the threshold.
-        alpha_min, alpha_min_high: Least and greatest value that the threshold may have.
+        opacity_low, opacity_high: Bounds of the opacity.
+        kappa: Relative error of the computed exponent.
+        sigma_max: Exponent above which alpha is below the threshold.
+        alpha_min, alpha_min_high: Bounds of the alpha threshold.
         alpha_max: Larger alphas are lowered to it.
         sure: 1 where the Gaussian surely belongs to the tile, else 0.
     """
@@ -46,13 +46,13 @@ class Limits(NamedTuple):
 
 
 class Exponent(NamedTuple):
-    """Exponents of eight pixels.
+    """Exponents of eight pixels, as bounds and forms.
 
     Attributes:
         low, high: Bounds.
         center, radius: Of the form.
-        slope, bend: Sizes of its linear part and of its quadratic one, which is never negative.
-        turn: Twice what stands for the quadratic part in products with it.
+        slope, bend: Magnitudes of its linear part and of its quadratic part, which is never negative.
+        turn: Twice the number that stands for the quadratic part in products with it.
     """
 
     low: Any
@@ -67,7 +67,8 @@ class Exponent(NamedTuple):
 class Alpha(NamedTuple):
     """Alphas of eight pixels: bounds, the form's centre and radius, and `ThresholdedAlpha.crossing`.
 
-    The form's coefficients are ``weight`` times the exponent's, and ``curve`` times those of its linear part squared.
+    The form's linear coefficients are ``weight`` times the exponent's, the quadratic ones ``curve`` times the products
+    of the exponent's linear coefficients.
     """
 
     low: Any
@@ -80,12 +81,12 @@ class Alpha(NamedTuple):
 
 
 class _Range(NamedTuple):
-    """Exponents of eight pixels as the program computes them, and their exponentials (design.md, B3).
+    """Ranges of the computed exponents of eight pixels, and their exponentials (docs/dev/design.md, B3).
 
     Attributes:
-        low: The least.
-        middle, half: Of the range that is fitted, its middle and half of its width.
-        fits: 1 where that is all of it, else 0.
+        low: The least exponent.
+        middle, half: Middle and half width of the range over which the exponential is fitted.
+        fits: 1 where that is the whole range, else 0.
         radius: Of the form.
         at_low, fall: exp(-low), exp(-half).
         scale: Alpha at ``middle``.
@@ -104,13 +105,13 @@ class _Range(NamedTuple):
 
 
 class ThresholdedAlpha(NamedTuple):
-    """Alphas of eight pixels after the thresholds.
+    """Alphas of eight pixels after alpha threshold and cap.
 
     Attributes:
         low, high: Bounds.
         center, radius: Of the form.
-        keep: 1 unless it is constant.
-        crossing: Alpha up to which the fragment may be skipped; 0 where it is not, or the form is constant.
+        keep: 1 unless the form is constant.
+        crossing: Alpha up to which the fragment may be skipped; 0 where it never is, or the form is constant.
     """
 
     low: Any
@@ -123,7 +124,7 @@ class ThresholdedAlpha(NamedTuple):
 
 @njit(cache=True, error_model="numpy", forceinline=True)
 def exponential_range(low, high, radius, limits, charges):
-    """The `_Range` of exponents from ``low`` to ``high`` whose form has the ``radius`` (design.md, B3)."""
+    """Return the `_Range` of exponents from ``low`` to ``high`` whose form has the ``radius`` (design.md, B3)."""
     kappa = limits.kappa
     low = minimum(maximum(0.0, low * (1.0 - kappa)), EXPONENT_CUT)
     high = maximum(low, high * (1.0 + kappa))
@@ -147,7 +148,7 @@ def exponential_range(low, high, radius, limits, charges):
 
 @njit(cache=True, error_model="numpy", forceinline=True)
 def _bessel_terms(x):
-    """I0 - 2 I2, 2 I1 / r and 4 I2 / r^2 of modified Bessel functions at r = 2 sqrt(x), as cut series (B3)."""
+    """Return I0 - 2 I2, 2 I1 / r, 4 I2 / r^2 of modified Bessel functions at r = 2 sqrt(x), by cut series (B3)."""
     i0 = fma(x, fma(x, fma(x, fma(x, 1.0 / 576.0, 1.0 / 36.0), 0.25), 1.0), 1.0)
     k1 = fma(x, fma(x, fma(x, fma(x, 1.0 / 2880.0, 1.0 / 144.0), 1.0 / 12.0), 0.5), 1.0)
     k2 = fma(x, fma(x, fma(x, fma(x, 1.0 / 17280.0, 1.0 / 720.0), 1.0 / 48.0), 1.0 / 6.0), 0.5)
@@ -156,10 +157,10 @@ def _bessel_terms(x):
 
 @njit(cache=True, error_model="numpy", forceinline=True)
 def cubic_exponential(low, high, center, radius, linear, quadratic, limits, charges):
-    """Opacity exp(-sigma) for one parameter, fitted by a polynomial of degree 3 (design.md, B3).
+    """Return opacity exp(-sigma) for one parameter, fitted by a polynomial of degree 3 (design.md, B3).
 
-    The exponent sigma lies between ``low`` and ``high`` and within ``radius`` of
-    ``center`` + ``linear`` p + ``quadratic`` p^2. Returns the `ThresholdedAlpha`, and the coefficients of p and p^2.
+    The exponent sigma lies between ``low`` and ``high`` and within ``radius`` of ``center`` + ``linear`` p +
+    ``quadratic`` p^2. The result is the `ThresholdedAlpha`, and the coefficients of p and p^2.
     """
     sigma = exponential_range(low, high, radius, limits, charges)
     # exp(-t) = k0 - k1 t + k2 t^2 - k3 t^3 +- fit over |t| <= half
@@ -198,7 +199,7 @@ def cubic_exponential(low, high, center, radius, linear, quadratic, limits, char
 
 @njit(cache=True, error_model="numpy", forceinline=True)
 def fitted_exponential(exponent, limits, charges):
-    """The `Alpha` opacity exp(-sigma) of an `Exponent`, with its thresholds (design.md, B3-B4)."""
+    """Return the `Alpha` opacity exp(-sigma) of an `Exponent`, after alpha threshold and cap (design.md, B3-B4)."""
     l, b = exponent.slope, exponent.bend
     sigma = exponential_range(exponent.low, exponent.high, exponent.radius, limits, charges)
     # exp(-t) = k0 - k1 t + k2 t^2 +- fit over |t| <= half
@@ -227,7 +228,7 @@ def fitted_exponential(exponent, limits, charges):
 
 @njit(cache=True, error_model="numpy", forceinline=True)
 def thresholded(middle, error, sigma, limits, charges):
-    """The `ThresholdedAlpha` of the `_Range` ``sigma``; the form is about ``middle``, off by ``error`` (B4)."""
+    """Return the `ThresholdedAlpha` of the `_Range` ``sigma``, with a form around ``middle`` within ``error`` (B4)."""
     opacity_low, opacity_high, alpha_max = limits.opacity_low, limits.opacity_high, limits.alpha_max
     slack, at_low = sigma.slack, sigma.at_low
     opacity = 0.5 * (opacity_low + opacity_high)

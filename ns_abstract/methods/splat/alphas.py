@@ -1,8 +1,8 @@
-"""Alphas as forms: one Gaussian on some pixels of a block, eight at a time (design.md, B1-B4, B12).
+"""Alphas of one Gaussian on some pixels of a block, as forms, eight pixels at a time (docs/dev/design.md, B1-B4, B12).
 
-The exponent is half the sum of two squares, y1 = P ax - Q ay - W1 and y2 = S ay - W2, and K where opacity is
-compensated, of forms that the Gaussian's record holds. For one parameter its forms have order 2, else 1;
-alpha's have order 2 always (B10).
+The exponent is half the sum of two squares, y1 = P ax - Q ay - W1 and y2 = S ay - W2, and of K where opacity is
+compensated. P, Q, S, W1, W2 and K are forms in the Gaussian's record. They have order 2 for one parameter, else 1; the
+forms of alpha always have order 2 (B10).
 """
 
 from __future__ import annotations
@@ -50,7 +50,7 @@ _ALL = 255
 
 
 class _Whitened(NamedTuple):
-    """Forms y1 and y2 of eight pixels: centres, sizes of their linear parts, radii."""
+    """Forms y1 and y2 of eight pixels: centres, magnitudes of their linear parts, radii."""
 
     c1: Any
     c2: Any
@@ -61,7 +61,7 @@ class _Whitened(NamedTuple):
 
 
 class _AffineForms(NamedTuple):
-    """Centres of a record's forms of order 1, radii with the centres' rounding, and the ends of K."""
+    """Centres of a record's forms of order 1, radii including the centres' rounding, and bounds of K."""
 
     p: float
     q: float
@@ -81,7 +81,7 @@ class _AffineForms(NamedTuple):
 
 @njit(cache=True, error_model="numpy", inline="always")
 def _square_sum_range(c1, c2, e1, e2, k_low, k_high):
-    """Bounds of (y1^2 + y2^2)/2 + K for |y - c| <= e, c >= 0 (design.md, B2)."""
+    """Return bounds of (y1^2 + y2^2)/2 + K for |y - c| <= e, c >= 0 (design.md, B2)."""
     near1 = maximum(0.0, c1 - e1)
     near2 = maximum(0.0, c2 - e2)
     far1 = c1 + e1
@@ -92,13 +92,13 @@ def _square_sum_range(c1, c2, e1, e2, k_low, k_high):
 
 @njit(cache=True, error_model="numpy", inline="always")
 def _quadratic_radius(c, l, b, r):
-    """Radius of y^2/2 of order 2 from the sizes c, l, b, r of the parts of y (design.md, B2)."""
+    """Return the radius of y^2/2 of order 2 from the magnitudes c, l, b, r of the parts of y (design.md, B2)."""
     return fma(c, r, fma(l + 0.5 * b, b, r * (l + b + 0.5 * r)))
 
 
 @njit(cache=True, error_model="numpy", inline="always")
 def _form(record, number, antialiased):
-    """Form ``number`` of order 2 of a record, its radius with the centre's rounding; K is 0 unless ``antialiased``."""
+    """Return form ``number`` of order 2 of a record, its radius with the centre's rounding; K is 0 if uncompensated."""
     at = FORMS + 4 * number
     if number < 5:
         return record[at], record[at + 1], record[at + 2], record[at + 3] + FRAGMENT_ROUNDING * abs(record[at])
@@ -109,7 +109,7 @@ def _form(record, number, antialiased):
 
 @njit(cache=True, error_model="numpy", forceinline=True)
 def _quadratic_alphas(record, begin, n, given, block, limits, charges, antialiased):
-    """`alphas` for one parameter and order 2."""
+    """Do `alphas` for one parameter and order 2."""
     batch, values = block.batch, block.fragments.values
     p0, p1, p2, pr = _form(record, 0, antialiased)
     c0, c1, c2, cr = _form(record, 1, antialiased)
@@ -168,7 +168,7 @@ def _quadratic_alphas(record, begin, n, given, block, limits, charges, antialias
 
 @njit(cache=True, error_model="numpy", forceinline=True)
 def _affine_forms(record, m, antialiased):
-    """The `_AffineForms` of a record."""
+    """Return the `_AffineForms` of a record."""
     stride = m + 1
     p, c, g = record[FORMS], record[FORMS + stride], record[FORMS + 2 * stride]
     w1, w2 = record[FORMS + 3 * stride], record[FORMS + 4 * stride]
@@ -198,7 +198,7 @@ def _affine_forms(record, m, antialiased):
 
 @njit(cache=True, error_model="numpy", forceinline=True)
 def _store_fragments(rows, alpha, fragments, at, m):
-    """Write eight fragments from their ``alpha``; ``rows`` [., 8] hold the exponent's slopes and alpha's curvature."""
+    """Write eight fragments from ``alpha``; ``rows`` [., 8] hold the exponent's slopes and alpha's curvature."""
     store(rows, 8 * fragments.crossing, alpha.crossing)
     store(rows, 8 * ALPHA_LOW, alpha.low)
     store(rows, 8 * ALPHA_HIGH, alpha.high)
@@ -211,7 +211,7 @@ def _store_fragments(rows, alpha, fragments, at, m):
 
 @njit(cache=True, error_model="numpy", forceinline=True)
 def _store_rows(rows, fragments, at):
-    """Write the columns of eight fragments, which stand in ``rows`` [width, 8], from ``at`` on."""
+    """Write eight fragments from column ``at`` on; their columns are ``rows`` [width, 8]."""
     values, width = fragments.values, fragments.width
     for k in range(0, width, 8):
         row = 8 * k
@@ -226,7 +226,7 @@ def _store_rows(rows, fragments, at):
 
 @njit(cache=True, error_model="numpy", forceinline=True)
 def _whitened(record, f, ax, ay, rows, at, m):
-    """The `_Whitened` of pixels at offsets ``ax``, ``ay`` (design.md, B1).
+    """Return the `_Whitened` of pixels at offsets ``ax``, ``ay`` from the mean (design.md, B1).
 
     ``rows`` [., 8] receives the slopes of y1 and y2 by parameter k = 1 ... m - 1 from ``at`` + 16 k on.
     """
@@ -249,9 +249,9 @@ def _whitened(record, f, ax, ay, rows, at, m):
 
 @njit(cache=True, error_model="numpy", forceinline=True)
 def _exponent_of_several(record, f, ax, ay, rows, scratch, m, antialiased):
-    """The `Exponent` of pixels at offsets ``ax``, ``ay`` (design.md, B1-B3, B10).
+    """Return the `Exponent` of pixels at offsets ``ax``, ``ay`` from the mean (design.md, B1-B3, B10).
 
-    ``rows`` [., 8] receives its slopes and behind the radius its curvature; ``scratch`` is the first that is free.
+    ``rows`` [., 8] receives its slopes and, behind the radius, its curvature; rows from ``scratch`` on are scratch.
     """
     bends = 8 * (FORM + m + 1)
     c1, c2, l1, l2, r1, r2 = _whitened(record, f, ax, ay, rows, scratch, m)
@@ -300,7 +300,7 @@ def _exponent_of_several(record, f, ax, ay, rows, scratch, m, antialiased):
 def _set_curvature(alpha, rows, scratch, m):
     """Turn the exponent's curvature in ``rows`` [., 8] into that of ``alpha``, and write its range (design.md, B10).
 
-    The rows hold the exponent's slopes, too; ``scratch`` is the first that is free.
+    The rows hold the exponent's slopes, too; rows from ``scratch`` on are scratch.
     """
     low = 0.0 * alpha.low
     high = low
@@ -329,7 +329,7 @@ def _set_curvature(alpha, rows, scratch, m):
 
 @njit(cache=True, error_model="numpy", forceinline=True)
 def _alphas_of_several(record, begin, n, given, block, limits, charges, antialiased, m):
-    """`alphas` for several parameters, or none: curvature of forms of order 1 (design.md, B10)."""
+    """Do `alphas` for several parameters, or none, with curvature beside forms of order 1 (design.md, B10)."""
     batch, rows, width = block.batch, block.batch.rows, block.fragments.width
     forms = _affine_forms(record, m, antialiased)
     drawn_lanes = 0
@@ -351,11 +351,11 @@ def _alphas_of_several(record, begin, n, given, block, limits, charges, antialia
 def _along_motion(rows, at, motion, r, size, inputs):
     """Replace the slopes of y1 or y2 by those along the pixels' image motion (design.md, B16).
 
-    The slope by parameter k = 1 ... m - 1 stands in ``rows`` [., 8] at ``at`` + 16 k, and the sum of their sizes is
-    ``size``; those by the two axes of the motion, which stands at ``motion``, come to the first two places.
+    The slope by parameter k = 1 ... m - 1 is in ``rows`` [., 8] at ``at`` + 16 k; ``size`` is the sum of their
+    magnitudes. The slopes by the two axes of the ``motion`` replace the first two.
 
     Returns:
-        The radius over a part, from the form's radius ``r``, and the size of the slopes before and after.
+        The radius over a motion cell, from the form's radius ``r``, and the slopes' magnitude before and after.
     """
     d, half = inputs.shape.dimensions, inputs.parts.half
     first = 0.0 * size
@@ -377,7 +377,7 @@ def _along_motion(rows, at, motion, r, size, inputs):
 
 @njit(cache=True, error_model="numpy", forceinline=True)
 def _alphas_over_parts(record, begin, n, given, block, limits, inputs):
-    """`alphas` where pixels are bounded over parts of the cell: bounds over all of it, exponents (design.md, B12)."""
+    """Do `alphas` for cells bounded over parts: bounds over all of the cell, and exponents (design.md, B12)."""
     batch, rows, fragments = block.batch, block.batch.rows, block.fragments
     charges, half, m = inputs.charges, inputs.parts.half, inputs.shape.monomials
     forms = _affine_forms(record, m, inputs.rules.antialiased)
@@ -438,11 +438,11 @@ def _alphas_over_parts(record, begin, n, given, block, limits, inputs):
 
 @njit(cache=True, error_model="numpy", forceinline=True)
 def alphas(record, begin, n, given, sure, block, inputs):
-    """Alpha of one Gaussian on ``n`` pixels of a block (design.md, B1-B4, G12).
+    """Compute alpha of one Gaussian on ``n`` pixels of a block (design.md, B1-B4, G12).
 
-    ``record`` is the Gaussian's; the pixels' offsets from the mean stand in ``block.batch`` from ``begin`` on. Writes
-    what is known of alpha pixel by pixel to ``block.fragments.values`` from ``given`` on. ``sure`` tells whether the
-    Gaussian surely belongs to the tile. Returns the set of those of the pixels on which alpha may reach the threshold.
+    ``record`` is the Gaussian's; the pixels' offsets from the mean are in ``block.batch`` from ``begin`` on. Alphas go
+    to ``block.fragments.values`` from ``given`` on, pixel by pixel. ``sure``: whether the Gaussian surely belongs to
+    the tile. Returns the set of those of the pixels on which alpha may reach the threshold.
     """
     rules, charges, shape = inputs.rules, inputs.charges, inputs.shape
     alpha_min = rules.alpha_min * (1.0 - charges.threshold)

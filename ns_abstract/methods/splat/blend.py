@@ -1,6 +1,6 @@
-"""Blending of a pixel's fragments back to front, as forms and as intervals (design.md, B7-B11, O2-O4).
+"""Composites a pixel's fragments back to front, as forms and as intervals (docs/dev/design.md, B7-B11, O2-O4).
 
-SIMD lanes are the three channels, and a fourth one that is not used.
+SIMD lanes 0 to 2 hold the channels; lane 3 is padding.
 """
 
 from __future__ import annotations
@@ -46,7 +46,7 @@ from ns_abstract.methods.splat.threshold_crossings import bound_by_parts, clear_
 
 @dataclass(frozen=True)
 class BlendTuning:
-    """When skipped fragments are looked at together. None of them decides whether a bound holds."""
+    """When fragments that some poses skip are bounded jointly; soundness does not depend on it."""
 
     #: Crossings are looked at together where they may widen a pixel by more than this part.
     crossings_matter: float = 2.0**-4
@@ -60,7 +60,7 @@ class _PixelResult(NamedTuple):
 
     Attributes:
         low, high: Bounds by forms.
-        ends: By intervals.
+        ends: Bounds by intervals.
         center, radius: Of the linear sets, whose slopes are those of the polynomials.
     """
 
@@ -72,13 +72,13 @@ class _PixelResult(NamedTuple):
 
 
 class _Blend(NamedTuple):
-    """A blended pixel; lanes are channels.
+    """A composited pixel; lanes are channels.
 
     Attributes:
         radius: Of the polynomials.
-        ends: The intervals.
-        crossings: Fragments that some poses skip, which the polynomials count as drawn.
-        since: The first of these that count.
+        ends: Bounds by intervals.
+        crossings: Number of fragments that some poses skip, which the polynomials count as drawn.
+        since: The first of these that counts.
     """
 
     radius: Any
@@ -89,7 +89,7 @@ class _Blend(NamedTuple):
 
 @njit(cache=True, error_model="numpy", forceinline=True)
 def _keep_distances(number, entry, nearest, farthest, size, crossings):
-    """Keep what a fragment's colour is beyond what lies behind, up to rounding of ``size``, for its skipping (B11)."""
+    """Store bounds of a skippable fragment's colour less the colour behind it, up to rounding of ``size`` (B11)."""
     room = FRAGMENT_ROUNDING * size
     crossings.entries[number] = entry
     store(crossings.distances, 8 * number, nearest - room)
@@ -98,10 +98,11 @@ def _keep_distances(number, entry, nearest, farthest, size, crossings):
 
 @njit(cache=True, error_model="numpy", forceinline=True)
 def blend_quadratic(begin, end, fragments, palette, moves, polynomials, crossings, split):
-    """Blend the list entries [begin, end) of a pixel back to front, as forms and as intervals (design.md, B7).
+    """Composite the list entries [begin, end) of a pixel back to front, as forms and as intervals (design.md, B7).
 
     For one parameter and order 2. Writes ``polynomials`` [m, 4]; returns a `_Blend` whose radii are not yet rounded up.
-    If ``split``, fragments that some poses skip are drawn and kept in ``crossings`` (B11); else their forms hold both.
+    If ``split``, fragments that some poses skip are drawn and stored in ``crossings`` (B11); else their forms enclose
+    both cases.
     """
     values, colors, forms = fragments.values, palette.values, palette.forms
     moving = forms > 1
@@ -160,7 +161,7 @@ def blend_quadratic(begin, end, fragments, palette, moves, polynomials, crossing
 
 @njit(cache=True, error_model="numpy", forceinline=True)
 def _curve_range(polynomials, scratch, m):
-    """Range of the quadratic parts of ``polynomials`` [m + bends, 4], at most 0 to at least 0 (B10)."""
+    """Return the range of the quadratic parts of ``polynomials`` [m + bends, 4], which contains 0 (B10)."""
     low = 0.0 * load4(polynomials, 0)
     high = low
     for k in range(1, m):
@@ -182,11 +183,11 @@ def _curve_range(polynomials, scratch, m):
 
 @njit(cache=True, error_model="numpy", forceinline=True)
 def _step_of_several(r, at, key, crossing, fragments, palette, polynomials, scratch, m):
-    """One fragment over polynomials and radii ``r``, drawn also up to 2 ``crossing`` of skipped alpha (B7, B10, B11).
+    """Composite one fragment over polynomials with radii ``r``, drawn also for up to 2 ``crossing`` of skipped alpha.
 
-    Returns the new radii, and the least and greatest of its colour beyond what lies behind, up to rounding of a size.
-    ``polynomials`` [m + bends, 4]: coefficients of order 0 and 1, then those of products of two parameters; ``scratch``
-    [m, 4] is overwritten.
+    Returns the new radii, and bounds of the fragment's colour less the colour behind it, up to rounding of a size (B7,
+    B10, B11). ``polynomials`` [m + bends, 4]: coefficients of order 0 and 1, then those of products of two parameters;
+    ``scratch`` [m, 4] is overwritten.
     """
     values, colors, forms = fragments.values, palette.values, palette.forms
     moving = forms > 1
@@ -235,7 +236,7 @@ def _step_of_several(r, at, key, crossing, fragments, palette, polynomials, scra
 
 @njit(cache=True, error_model="numpy", forceinline=True)
 def flattened(polynomials, r, scratch, m):
-    """Move the range of the curvature behind ``polynomials`` into their centres and radii; returns the radii (B10)."""
+    """Move the range of the curvature behind ``polynomials`` into centres and radii; return the radii (B10)."""
     low, high = _curve_range(polynomials, scratch, m)
     store(polynomials, 0, load4(polynomials, 0) + 0.5 * (low + high))
     return r + 0.5 * (high - low) + CURVE_ROUNDING * (abs(load4(polynomials, 0)) + 2.0 * (high - low))
@@ -243,7 +244,7 @@ def flattened(polynomials, r, scratch, m):
 
 @njit(cache=True, error_model="numpy", forceinline=True)
 def blend_several(begin, end, fragments, palette, moves, polynomials, m, crossings, split):
-    """`blend_quadratic` for several parameters, or none (design.md, B7, B10).
+    """Do `blend_quadratic` for several parameters, or none (design.md, B7, B10).
 
     Writes ``polynomials`` [m + bends, 4] with their curvature (see `flattened`).
     """
@@ -288,7 +289,7 @@ def blend_several(begin, end, fragments, palette, moves, polynomials, m, crossin
 
 @njit(cache=True, error_model="numpy", forceinline=True)
 def form_range(polynomials, r, order, m):
-    """Range over the box of ``polynomials`` [m, 4] of radii ``r``, rounded outward (design.md, A4)."""
+    """Return the range over the box of ``polynomials`` [m, 4] with radii ``r``, rounded outward (design.md, A4)."""
     middle = load4(polynomials, 0)
     bottom, top = middle, middle
     size = 0.0 * middle
@@ -305,10 +306,10 @@ def form_range(polynomials, r, order, m):
 
 @njit(cache=True, error_model="numpy")
 def _stop_slack(q, darkest, brightest, room, block, inputs, scratch):
-    """By how much a stop that the fragments of pixel q ignore may lower and raise the picture (design.md, B6, iii).
+    """Write how far an early termination that pixel q's fragments ignore may lower and raise the picture (B6, iii).
 
-    ``darkest`` and ``brightest`` bound all colours of the list, ``room`` the rounding of its blend. The two go to the
-    first 8 numbers of ``scratch``, channels in lanes.
+    ``darkest`` and ``brightest`` bound all colours of the list, ``room`` the rounding of its compositing. The two go to
+    the first 8 numbers of ``scratch``, channels in lanes.
     """
     fragments, palette, charges = block.fragments, block.palette, inputs.charges
     values, per_pixel, forms = fragments.values, fragments.per_pixel, palette.forms
@@ -339,7 +340,7 @@ def _stop_slack(q, darkest, brightest, room, block, inputs, scratch):
 
 @njit(cache=True, error_model="numpy", forceinline=True)
 def _slack(q, ends, block, inputs, scratch):
-    """By how much the bounds of pixel q are widened below and above beside what blending knows (design.md, B6, B8).
+    """Return how far the bounds of pixel q are widened below and above after compositing (design.md, B6, B8).
 
     ``scratch`` is scratch for 8 numbers.
     """
@@ -371,7 +372,7 @@ def _slack(q, ends, block, inputs, scratch):
 def _form_bounds(begin, end, block, inputs, linear):
     """Return the `_PixelResult` of a pixel's list entries [begin, end), by forms and intervals (design.md, B7-B11).
 
-    The block's sums receive the polynomials, scratch behind them; ``linear`` tells whether their sets are asked for.
+    The block's sums receive the polynomials, then scratch; ``linear``: whether linear sets are needed.
     """
     fragments, palette, moves, crossings = block.fragments, block.palette, block.reordering.moves, block.crossings
     polynomials, limit = block.sums, inputs.rules.alpha_min * (1.0 - inputs.charges.threshold)
@@ -429,11 +430,11 @@ def _form_bounds(begin, end, block, inputs, linear):
 
 @njit(cache=True, error_model="numpy")
 def shade(pixels, left, above, reordered, block, inputs, bounds):
-    """Blend the fragments of each of a block's ``pixels`` and write its bounds (design.md, B7-B9, B11, B12).
+    """Composite the fragments of each of a block's ``pixels`` and write its bounds (design.md, B7-B9, B11, B12).
 
-    The block begins at column ``left`` and row ``above`` of its tile, whose parts of `PixelBounds` are ``bounds``;
-    ``reordered`` tells whether fragments may move. Row OPEN of `Fragments.per_pixel` bounds the light that comes to
-    fragments that are missing and have colours between the two of `Palette.unseen`.
+    The block begins at column ``left`` and row ``above`` of its tile, whose slice of `PixelBounds` is ``bounds``;
+    ``reordered``: whether fragments may change their order. Row OPEN of `Fragments.per_pixel` bounds the light that
+    reaches missing fragments, whose colours lie between the two of `Palette.unseen`.
     """
     fragments, palette, polynomials = block.fragments, block.palette, block.sums
     lower, upper, linear, slopes = bounds.lower, bounds.upper, bounds.linear, bounds.slopes

@@ -1,4 +1,4 @@
-"""Memory of a block of pixels, which grows with its lists."""
+"""Memory of a block of pixels, which grows with the lengths of its lists."""
 
 from __future__ import annotations
 
@@ -39,7 +39,7 @@ _POSITIONS = 1024
 
 
 class Buffers(NamedTuple):
-    """Memory of a thread's blocks; the fields are those of `PixelBlock` and its parts."""
+    """Memory of a thread's blocks; its fields are those of `PixelBlock` and its parts."""
 
     per_pixel: np.ndarray
     offsets: np.ndarray
@@ -72,13 +72,13 @@ class Buffers(NamedTuple):
 
 @njit(cache=True, error_model="numpy")
 def _crossing_columns(shape, capacity):
-    """Columns of `ThresholdCrossings`: channels, then ``capacity``; the last row holds what a part needs."""
+    """Return memory for the columns of `ThresholdCrossings`: channels, ``capacity``; the last row is for one part."""
     return max(CROSSING_LANES + -(-capacity // CROSSING_LANES) * CROSSING_LANES, 20 * shape.dimensions + 80)
 
 
 @njit(cache=True, error_model="numpy")
 def _aligned(size):
-    """Uninitialised doubles that begin with a cache line."""
+    """Return uninitialised doubles that begin at a cache line."""
     memory = np.empty(size + 7)
     start = -(memory.ctypes.data // 8) % 8
     return memory[start : start + size]
@@ -86,14 +86,14 @@ def _aligned(size):
 
 @njit(cache=True, error_model="numpy")
 def _part_ends(shape, capacity):
-    """Memory for `PixelBlock.part_ends` with lists of ``capacity`` fragments."""
+    """Return memory for `PixelBlock.part_ends` with lists of ``capacity`` fragments."""
     by_interval = 6 * shape.parts + 2 * PART_LANES * capacity if shape.parts > 0 else 0
     return np.empty(PART_ENDS + max(by_interval, 6 * shape.sub_boxes))
 
 
 @njit(cache=True, error_model="numpy")
 def new_buffers(shape, forms, pair_limit, background):
-    """Memory for fragments of ``shape``, colours of ``forms`` coefficients and ``pair_limit`` pairs."""
+    """Return memory for fragments of ``shape``, colours of ``forms`` coefficients and ``pair_limit`` pairs."""
     per_pixel = np.zeros(ROWS * PIXELS)
     per_pixel[NUMBERS : NUMBERS + BLOCK] = np.arange(BLOCK)
     behind = np.zeros(4)
@@ -132,7 +132,7 @@ def new_buffers(shape, forms, pair_limit, background):
 
 @njit(cache=True, error_model="numpy")
 def resized(old, positions, capacity, shape, forms):
-    """``old`` buffers with room for lists of ``positions`` and ``capacity`` fragments by pixel, where that is more."""
+    """Return ``old`` buffers with room for at least ``positions`` list entries, and ``capacity`` fragments by pixel."""
     places, depths, palette, shifted = old.positions, old.depths, old.palette, old.shifted
     if positions > places.shape[1]:
         places, depths = np.empty((7, positions), np.int64), np.empty((2, positions))
@@ -185,7 +185,7 @@ def resized(old, positions, capacity, shape, forms):
 
 @njit(cache=True, error_model="numpy")
 def block_of(buffers, shape, forms):
-    """The block that lies in ``buffers``, which the caller keeps alive for as long as it is used."""
+    """Return the block in ``buffers``, which the caller keeps alive while it uses the block."""
     positions, depths = buffers.positions, buffers.depths
     fragments = Fragments(
         pointer(buffers.values),

@@ -65,14 +65,14 @@ PART_PAIR_LIMIT = 3_000
 
 
 class Stages(NamedTuple):
-    """Kernels of a cell, which write into memory that they are given; the slowest to compile first."""
+    """The kernels of a cell, which write into given memory; the slowest to compile comes first."""
 
     pixel_stage: Callable[..., object] = pixel_stage
     gaussian_stage: Callable[..., object] = gaussian_stage
     moving_colors: Callable[..., object] = moving_colors
 
     def alone(self, stage: str) -> Stages:
-        """The same with no-ops in place of all but one: what `SplatBounds.cell` then returns bounds nothing."""
+        """Return the stages with no-ops in place of all but one; the bounds of `SplatBounds.cell` then mean nothing."""
         # no Gaussian is seen
         nothing = Stages(lambda *_: None, lambda *arguments: arguments[-1].fill(0), lambda *_: None)
         return nothing._replace(**{stage: getattr(self, stage)})
@@ -85,13 +85,13 @@ class CellBounds:
     Attributes:
         wanted: [t] tile numbers, row-major.
         lower, upper: [t, side, side, 3] float64 enclosures of every image of the cell.
-        visible: [n] scene indices of the Gaussians that some pose of the cell may show on the pixels that were wanted.
-        reach: [n, 4] rectangles of pixels outside of which they are not seen: columns first and past, rows likewise.
+        visible: [n] scene indices of the Gaussians that some pose of the cell may show on the requested pixels.
+        reach: [n, 4] rectangles of pixels outside of which they are invisible: columns first and past, rows likewise.
         linear: [t, side, side, 3, m + 1] polynomial coefficients and radius, or None.
         layers: [t, side, side, 4] accumulation and expected depth as in `PixelBounds.layers`, or None.
-        slopes: [d] mean absolute linear coefficients; 0 where pixels were not wanted.
-        statistics: Blocks, layers, uncertain pairs, blocks that gave up on order, pixels with results that were not
-            numbers.
+        slopes: [d] mean absolute linear coefficients; 0 for pixels that were not requested.
+        statistics: Counts of blocks, layers, uncertain pairs, blocks with too many depth orders, and pixels whose
+            results were not numbers.
         parts: [t, side, side, 6, parts] as in `PixelBounds`, or None.
     """
 
@@ -108,7 +108,7 @@ class CellBounds:
 
 
 class SceneSums:
-    """What bounds need of a scene whatever the poses; each part is made when it is first asked for.
+    """Quantities of a scene that do not depend on the pose; each is computed at first use.
 
     Args:
         splats: The activated scene.
@@ -122,7 +122,7 @@ class SceneSums:
 
     @cached_property
     def gaussians(self) -> SceneGaussians:
-        """What the per-Gaussian stage reads."""
+        """The arrays that the per-Gaussian stage reads."""
         axes, varied = self._splats.axes, self._varied
         return SceneGaussians(
             means=varied.mean_middle,
@@ -137,7 +137,7 @@ class SceneSums:
 
     @cached_property
     def color_radius(self) -> float:
-        """Bound of the float error of colours that depend on no direction."""
+        """Bound of the float error of view-independent colours."""
         if self._splats.degree > 0:
             return 0.0
         return self._charges.plain_color * float(np.abs(self._splats.sh).max(initial=1.0))
@@ -149,7 +149,7 @@ class SceneSums:
 
     @cached_property
     def plain_colors(self) -> np.ndarray | None:
-        """Colours that depend on no direction, where they vary; see `_shifted_colors`."""
+        """View-independent colours where they vary, else None; see `_shifted_colors`."""
         return _shifted_colors(self._varied, self._charges)
 
     @cached_property
@@ -167,7 +167,7 @@ class SceneSums:
 def _divided(
     basis: Basis, parts: np.ndarray | MotionCells | None, keep_parts: bool, sub_boxes: SubBoxes | None
 ) -> tuple[FormShape, Parts]:
-    """The forms of a cell, and its equal parts or sub-boxes, if it is to be divided; see `SplatBounds.cell`."""
+    """Return the forms of a cell, and its equal parts or sub-boxes, if it is divided; see `SplatBounds.cell`."""
     if parts is not None:
         return divided_by(basis, parts, SUB_BOX_OVERLAP * keep_parts)
     if sub_boxes is None:
@@ -178,7 +178,7 @@ def _divided(
 
 
 def divided_by(basis: Basis, parts: np.ndarray | MotionCells, overlap: float) -> tuple[FormShape, Parts]:
-    """The forms of a cell that is bounded over ``parts``, and these parts; see `cell_parts`."""
+    """Return the forms of a cell that is bounded over ``parts``, and these parts; see `cell_parts`."""
     if not isinstance(parts, MotionCells):
         check_parts(parts, basis.dimensions)
         return form_shape(basis, int(parts.prod())), cell_parts(parts, overlap)
@@ -188,7 +188,7 @@ def divided_by(basis: Basis, parts: np.ndarray | MotionCells, overlap: float) ->
 
 
 def _cell_poses(forms: PoseForms) -> CellPoses:
-    """The cell's poses as the Gaussians' stage takes them."""
+    """Return the cell's poses in the form that the per-Gaussian stage takes."""
     rotation, position = (
         np.maximum(np.abs(low), np.abs(high)) for low, high in (forms.rotation.bounds(), forms.position.bounds())
     )
@@ -201,9 +201,9 @@ class SplatBounds:
     Args:
         splats: The activated scene.
         rasteriser: The rules of the bounded program.
-        arithmetic: What that program computes with.
+        arithmetic: The arithmetic of that program.
         varied: The set of scenes that is bounded with each pose; None: ``splats`` alone.
-        sums: Those of this scene, where other frames have them, too.
+        sums: The `SceneSums` of this scene, to be shared with other frames.
 
     Attributes:
         stages: The compiled kernels that `cell` runs.
@@ -233,13 +233,13 @@ class SplatBounds:
         self._seen_from: dict[int, tuple[tuple[float, ...], np.ndarray]] = {}
 
     def _tied(self, origin: np.ndarray) -> bool:
-        """Whether means are equal where their differences to ``origin`` [3] are, and none varies (design.md, O1)."""
+        """Return whether means are surely equal where their differences to ``origin`` [3] are (design.md, O1)."""
         largest = self._sums.largest_mean + float(np.abs(origin).max())
         # two roundings of the differences
         return self.varied.mean_radius.shape[0] == 0 and self._sums.least_step > TIE_ROUNDING * largest
 
     def _buffer(self, name: str, shape: tuple[int, ...], dtype: type = np.float64) -> np.ndarray:
-        """Uninitialised memory that begins with a cache line and is kept from call to call of the same thread group."""
+        """Return uninitialised memory that begins at a cache line and is reused by calls of the same thread group."""
         size, key = math.prod(shape), (thread_group(), name)
         buffer = self._buffers.get(key)
         if buffer is None or buffer.size < size:
@@ -262,26 +262,26 @@ class SplatBounds:
         keep_parts: bool = False,
         sub_boxes: SubBoxes | None = None,
     ) -> CellBounds:
-        """Bounds of the tiles ``wanted`` over the poses enclosed by ``forms`` (design.md, G10).
+        """Return bounds of the tiles ``wanted`` over the poses enclosed by ``forms`` (design.md, G10).
 
         Args:
             camera: Intrinsics and size.
             forms: The cell's poses.
             wanted: Tile numbers; all if None.
-            candidates: Scene indices that may be visible there (from an enclosing cell), or what `project` returned of
+            candidates: Scene indices that may be visible there (from an enclosing cell), or the result of `project` for
                 the cell, if that is known; all if None.
             keep_linear: Whether to return the linear sets.
-            floor: What no more light comes to may have any colour that is there (B6); negative, and for rasterisers
-                without a stop: every layer counts.
+            floor: Fragments that get no more light than this may have any colour that is there (B6); negative, and for
+                rasterisers without early termination: every fragment counts.
             layers: Whether to bound accumulation and expected depth, too.
-            pixels: [t, side, side] which of the tiles' pixels are wanted, nothing is said of the others; all if None.
+            pixels: [t, side, side] the requested pixels, the others have no meaningful bounds; all if None.
             parts: [d] numbers of parts along the cell's axes, powers of two and at least `PART_LANES` together: bound
                 pixels by intervals over each of them, not by forms (B12).
             keep_parts: Whether to return bounds over each of these parts.
             sub_boxes: Bound pixels by forms over each of these, too, and return these bounds as ``parts`` (B13).
 
         Raises:
-            ValueError: Linear sets, layers or ``sub_boxes`` are asked for together with ``parts``, or numbers of parts
+            ValueError: Linear sets, layers or ``sub_boxes`` are requested together with ``parts``, or numbers of parts
                 or sub-boxes are not as above.
         """
         if parts is not None and (keep_linear or layers or sub_boxes is not None):
@@ -323,7 +323,7 @@ class SplatBounds:
         )  # fmt: skip
 
     def project(self, camera: PinholeCamera, forms: PoseForms, candidates: np.ndarray | None = None) -> ProjectedCell:
-        """Project the Gaussians ``candidates``, all if None, over the poses enclosed by ``forms``."""
+        """Return the Gaussians ``candidates``, all if None, projected over the poses enclosed by ``forms``."""
         if candidates is None:
             candidates = np.arange(self.splats.count, dtype=np.int32)
         poses = _cell_poses(forms)
@@ -336,7 +336,7 @@ class SplatBounds:
     def _projected(
         self, candidates: np.ndarray, poses: CellPoses, camera: PinholeCamera, shape: FormShape
     ) -> tuple[ProjectedGaussians, np.ndarray]:
-        """The candidates' forms, and the places [k] of those that some pose shows."""
+        """Return the candidates' forms, and the numbers [k] of the candidates that some pose shows."""
         n = candidates.size
         gaussians, state = self._room(n, shape.monomials), self._buffer("state", (n,), np.uint8)
         self.stages.gaussian_stage(
@@ -348,7 +348,7 @@ class SplatBounds:
     def _allocate_bounds(
         self, tiles: int, gaussians: int, shape: FormShape, keep_linear: bool, layers: bool, with_ends: bool
     ) -> PixelBounds:
-        """The output of the pixel stage for so many tiles and candidates, not filled in."""
+        """Return uninitialised output of the pixel stage for ``tiles`` tiles and ``gaussians`` candidates."""
         shaped = (tiles, self.side, self.side, 3)
         return PixelBounds(
             lower=np.zeros(shaped),
@@ -363,7 +363,7 @@ class SplatBounds:
         )
 
     def _room(self, n: int, m: int) -> ProjectedGaussians:
-        """Memory for ``n`` Gaussians' forms of ``m`` coefficients."""
+        """Return memory for ``n`` Gaussians' forms of ``m`` coefficients."""
         return ProjectedGaussians(
             record=self._buffer("record", (n, columns(6 if self.splats.antialiased else 5, m))),
             box=self._buffer("box", (n, 4)),
@@ -374,13 +374,13 @@ class SplatBounds:
         )
 
     def _listed(self, alive: np.ndarray, candidates: np.ndarray, gaussians: ProjectedGaussians) -> np.ndarray:
-        """The rows ``alive`` of ``gaussians``, nearest first; they are the scene's ``candidates[alive]``."""
+        """Return the rows ``alive`` of ``gaussians``, nearest first; they are the scene's ``candidates[alive]``."""
         return depth_order(alive, gaussians.depth)
 
     def _viewing_axes(
         self, forms: PoseForms, rotation_magnitude: np.ndarray, gaussians: ProjectedGaussians
     ) -> ViewingAxes:
-        """What decides the order of ``gaussians``."""
+        """Return the quantities that decide the depth order of ``gaussians``."""
         rotation = forms.rotation.data
         # the third row of the rotation; its float32 rounding is the same for every Gaussian
         slope = np.ascontiguousarray(rotation[:, 6:9])
@@ -390,7 +390,7 @@ class SplatBounds:
     def _depths(
         self, poses: CellPoses, candidates: np.ndarray, alive: np.ndarray, delta: np.ndarray, m: int
     ) -> np.ndarray:
-        """[k, m + 1] forms of the depths of candidates ``alive`` [k] against the offset's (design.md, D1)."""
+        """Return forms [k, m + 1] of the depths of candidates ``alive`` [k] less the offset's (design.md, D1)."""
         axis, most = poses.rotation[: m + 1, 6:9], poses.rotation_magnitude[6:9]
         away = delta[alive]
         forms = away @ axis.T
@@ -407,7 +407,7 @@ class SplatBounds:
         return forms
 
     def _cutoffs(self, floor: float, pairs: int) -> Cutoffs:
-        """What need not be followed where no more light than ``floor`` comes (design.md, B6, B8)."""
+        """Return the limits for fragments that get no more light than ``floor`` (design.md, B6, B8)."""
         stop, fade = self.rules.transmittance_min, 0.0
         if stop > 0.0 < floor:
             # each fragment that is drawn dims the light by the least alpha or more, and is added with one rounding
@@ -420,7 +420,7 @@ class SplatBounds:
     def _colors(
         self, forms: PoseForms, camera_magnitude: np.ndarray, candidates: np.ndarray, alive: np.ndarray, n: int
     ) -> np.ndarray:
-        """Colours of the visible Gaussians: [n, 3], [n, 6] (centre, radius) or forms."""
+        """Return colours of the visible Gaussians: [n, 3], [n, 6] (centre, radius) or forms."""
         splats, varied = self.splats, self.varied
         if splats.degree == 0:
             if self._sums.plain_colors is not None:
@@ -460,7 +460,7 @@ class SplatBounds:
 
 
 def _four_channels(colors: np.ndarray, depths: np.ndarray, alive: np.ndarray, m: int) -> np.ndarray:
-    """[n, 4 (m + 1)] colours of any shape of `Colors.values`, and the ``depths`` [k, m + 1] of the rows ``alive``."""
+    """Return [n, 4 (m + 1)] colours of any shape of `Colors.values`, and ``depths`` [k, m + 1] of rows ``alive``."""
     n = colors.shape[0]
     wide = np.zeros((n, 4, m + 1))
     columns = colors.shape[1] // 3
@@ -476,7 +476,7 @@ def _four_channels(colors: np.ndarray, depths: np.ndarray, alive: np.ndarray, m:
 
 
 def _gram_deviation(forms: PoseForms) -> float:
-    """How far R^T R is from the identity, at most (Frobenius norm); the same at every pose of a set (design.md, C4)."""
+    """Return the largest distance of R^T R from the identity (Frobenius norm), the same at every pose of a set (C4)."""
     matrix = forms.rotation.data[0].reshape(3, 3)
     radius = float(np.linalg.norm(forms.rotation.data[forms.rotation.basis.monomials]))
     middle = float(np.linalg.norm(matrix.T @ matrix - np.eye(3)))
@@ -484,7 +484,7 @@ def _gram_deviation(forms: PoseForms) -> float:
 
 
 def _shifted_colors(varied: VariedSplats, charges: Charges) -> np.ndarray | None:
-    """[N, 6] centre and radius by channel of view-independent colours (design.md, S4); None where none varies."""
+    """Return [N, 6] centre and radius by channel of view-independent colours (S4); None where none varies."""
     if not varied.shift_low.size:
         return None
     color, top = varied.stored.sh[:, 0], varied.stored.color_max

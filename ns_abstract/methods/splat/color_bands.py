@@ -1,6 +1,7 @@
-"""One end of a pixel over strips of eight sub-boxes, by bands of colour (design.md, B14).
+"""Bounds one end of a pixel over strips of eight sub-boxes, by bands of colour (docs/dev/design.md, B14).
 
-SIMD lanes are the sub-boxes of a strip.
+A band is an interval of colour values; a colour is the sum of the bands that it reaches. SIMD lanes are the sub-boxes
+of a strip.
 """
 
 from __future__ import annotations
@@ -25,7 +26,7 @@ _ALL = 255
 
 @dataclass(frozen=True)
 class ColorBandTuning:
-    """How many bands of colour there are, and where lists end. Neither decides whether a bound holds."""
+    """The number of bands, and where lists end; soundness does not depend on them."""
 
     #: Bands of colour.
     bands: int = 8
@@ -41,7 +42,7 @@ _WORTH = ColorBandTuning.worth
 
 
 class ColorEnd(NamedTuple):
-    """One row of `ColorEnds`: number, colours, background, the opposite end, and the brightest of all rows."""
+    """One row of `ColorEnds`: number, colours, background, number of the opposite end, and the brightest colour."""
 
     row: int
     colors: np.ndarray
@@ -54,12 +55,12 @@ class BandSums(NamedTuple):
     """Sums of a pixel over strips of eight sub-boxes; lanes are the sub-boxes of a strip.
 
     Attributes:
-        levels: [bands + 1] colours that the bands lie between, the last of which none is beyond.
-        drawn, transmittance, occluded: [strips, bands, 8] A, B and C of B14: the part of a band that the picture
-            reaches is at most ``drawn``, and ``transmittance`` times that of what follows, and ``occluded``, which is
-            not positive, times what it is at the band's end.
-        least_transmittance, most_transmittance: [strips, 8] of the fragments so far, whatever their order.
-        stopped: [strips, 8] most transmittance at a stop.
+        levels: [bands + 1] colours between which the bands lie; no colour is beyond the last one.
+        drawn, transmittance, occluded: [strips, bands, 8] A, B and C of B14. The picture reaches at most ``drawn`` of a
+            band, plus ``transmittance`` times what the fragments behind reach, plus ``occluded``, which is not
+            positive, times that at the band's end.
+        least_transmittance, most_transmittance: [strips, 8] of the fragments so far, in any order.
+        stopped: [strips, 8] largest transmittance at an early termination.
     """
 
     levels: np.ndarray
@@ -72,14 +73,14 @@ class BandSums(NamedTuple):
 
 
 class EndCharges(NamedTuple):
-    """What is added to an end (design.md, B6, B8, B14).
+    """Charges on an end (design.md, B6, B8, B14).
 
     Attributes:
-        slack: For rounding, and for what was left out.
-        hidden: Most by which light that a stop leaves raises an end.
-        stop: Light at which fragments stop; not positive: they do not.
-        dark: Least light of all fragments beyond which none stopped.
-        grown: By how much the program's light may be more.
+        slack: For rounding, and for omitted fragments.
+        hidden: Largest rise of an end by light that an early termination leaves.
+        stop: Transmittance of early termination; not positive: there is none.
+        dark: Least transmittance of all fragments above which none terminated.
+        grown: Factor on the program's transmittance.
     """
 
     slack: float
@@ -91,7 +92,7 @@ class EndCharges(NamedTuple):
 
 @njit(cache=True, error_model="numpy", forceinline=True)
 def end_charges(count, inputs, end):
-    """The `EndCharges` of a pixel of ``count`` fragments."""
+    """Return the `EndCharges` of a pixel of ``count`` fragments."""
     charges = inputs.charges
     # rounding of the program's own sums and products
     rounding = (charges.blend_fragment * count + charges.blend_pixel) * end.bright * SECOND_ORDER
@@ -136,7 +137,7 @@ def choose_levels(looked_at, count, end, work, sums):
 
 @njit(cache=True, error_model="numpy", forceinline=True)
 def share_of(color, band, levels):
-    """The part of a band that a colour which is not beyond it reaches."""
+    """Return the fraction of a band that a colour, which is not beyond it, reaches."""
     if band >= BANDS or not color > levels[band]:
         return 0.0
     return (color - levels[band]) / (levels[band + 1] - levels[band])
@@ -144,9 +145,9 @@ def share_of(color, band, levels):
 
 @njit(cache=True, error_model="numpy", forceinline=True)
 def occlude(e, open_, dark, parts, work, sums):
-    """Let fragment e occlude what comes behind it in the bands that its colour does not reach (design.md, B14).
+    """Let fragment e occlude the fragments behind it in the bands that its colour does not reach (design.md, B14).
 
-    The rasteriser may stop at it only where the transmittance of all that may come before it is at most ``dark``.
+    Early termination at it is possible only where the transmittance of all that may come before it is at most ``dark``.
     """
     strips, below, share = work.strips[e] & open_, work.below[e], work.share[e]
     while strips != 0:
@@ -202,9 +203,9 @@ def composite(k, strips, values, at, thresholds, charges, inputs, work, sums):
 
 @njit(cache=True, error_model="numpy", forceinline=True)
 def retire_decided_strips(open_, goal, charges, sums):
-    """Return the strips of ``open_`` that are not decided; in the others all that is behind counts as drawn.
+    """Return the strips of ``open_`` that are not decided; in the others everything behind counts as drawn.
 
-    A strip is decided where little can follow, or where its ends are below ``goal`` anyhow, or beyond it already.
+    A strip is decided where little can follow, or where its ends are surely below ``goal``, or beyond it already.
     """
     some = open_
     while some != 0:
@@ -228,7 +229,7 @@ def retire_decided_strips(open_, goal, charges, sums):
 
 @njit(cache=True, error_model="numpy")
 def keep_possible_stops(closed, last, past, count, parts, work, sums):
-    """Let the rasteriser stop at each fragment up to ``last`` whose far end is not passed, in the strips ``closed``."""
+    """Allow early termination, in strips ``closed``, at each fragment up to ``last`` whose far end is not passed."""
     if closed == 0:
         return
     for place in range(past, count):
@@ -245,7 +246,7 @@ def keep_possible_stops(closed, last, past, count, parts, work, sums):
 def write_end(q, open_, charges, place, end, sums, out):
     """Write pixel q's ends with their charges to ``out`` [side, side, 6, parts] (design.md, B6, B8, B14).
 
-    ``open_``: the strips that the background may be seen in.
+    ``open_``: the strips in which the background may be visible.
     """
     side, levels = out.shape[0], sums.levels
     ends = out[place.y0 % side + q // BLOCK, place.x0 % side + q % BLOCK, end.row]

@@ -1,4 +1,4 @@
-"""Colours of Gaussians: spherical harmonics, concretely and as forms (spherical_harmonics.cuh)."""
+"""Colours of Gaussians by spherical harmonics, as numbers and as forms (spherical_harmonics.cuh)."""
 
 from __future__ import annotations
 
@@ -46,7 +46,7 @@ class _ColorScratch(NamedTuple):
 
 
 def color_magnitudes(sh: np.ndarray, degree: int) -> np.ndarray:
-    """[N, 6] by channel: most that ``sh`` [N, K, 3] can add up to, and most that it changes by with the direction."""
+    """Return [N, 6] by channel: the largest sum of ``sh`` [N, K, 3], and its largest change with the direction."""
     magnitudes = np.zeros((sh.shape[0], 6))
     for k in range((degree + 1) * (degree + 1)):
         sizes = np.abs(sh[:, k])
@@ -58,7 +58,7 @@ def color_magnitudes(sh: np.ndarray, degree: int) -> np.ndarray:
 
 @njit(cache=True, error_model="numpy")
 def sh_basis(x, y, z, degree, out):
-    """Real spherical harmonics of the unit direction, bands 0 to ``degree``, in gsplat's order."""
+    """Write the real spherical harmonics of a unit direction, bands 0 to ``degree``, in gsplat's order."""
     out[0] = 0.2820947917738781
     if degree >= 1:
         out[1] = -0.48860251190292 * y
@@ -88,7 +88,7 @@ def sh_basis(x, y, z, degree, out):
 
 @njit(cache=True, error_model="numpy")
 def sh_color(sh, direction, degree, basis, out):
-    """``out[c] = max(0, 0.5 + sum_k basis_k sh[k, c])`` for an unnormalised ``direction`` [3]."""
+    """Write ``out[c] = max(0, 0.5 + sum_k basis_k sh[k, c])`` for an unnormalised ``direction`` [3]."""
     length = math.sqrt(direction[0] * direction[0] + direction[1] * direction[1] + direction[2] * direction[2])
     sh_basis(direction[0] / length, direction[1] / length, direction[2] / length, degree, basis)
     for c in range(3):
@@ -100,17 +100,15 @@ def sh_color(sh, direction, degree, basis, out):
 
 @njit(cache=True, error_model="numpy")
 def _color_error(size, change, charges, direction_error):
-    """Float error of one colour, see `color_magnitudes` (design.md, C3)."""
+    """Return a bound of the float error of one colour, see `color_magnitudes` (design.md, C3)."""
     return charges.color_sum + charges.harmonics * size + direction_error * change
 
 
 @njit(cache=True, error_model="numpy")
 def _direction_error(length, position_error, means, mean_radius, i, charges):
-    """Angle between the directions to a Gaussian at distance ``length`` and any that the program may use, at most 2.
+    """Return the largest angle between the direction to a Gaussian and any that the program may use, at most 2.
 
-    See design.md, S4.
-
-    See design.md, C3.
+    ``length``: the Gaussian's distance. See design.md, C3, S4.
     """
     size = abs(means[i, 0]) + abs(means[i, 1]) + abs(means[i, 2])
     spread = 0.0
@@ -130,7 +128,7 @@ def _direction_error(length, position_error, means, mean_radius, i, charges):
 
 @njit(cache=True, error_model="numpy", nogil=True)
 def _fixed_worker(counter_, scene, position, position_error, charges, colors):
-    """One thread's Gaussians: the next chunk that none has taken yet; see `fixed_colors`."""
+    """Do the chunks of Gaussians that no other thread has taken; see `fixed_colors`."""
     counter, count = pointer(counter_), scene.means.shape[0]
     means, mean_radius, magnitudes = borrowed(scene.means), borrowed(scene.mean_radius), borrowed(scene.magnitudes)
     shift_low, shift_high, sh = borrowed(scene.low), borrowed(scene.high), borrowed(scene.sh)
@@ -163,11 +161,11 @@ def _fixed_worker(counter_, scene, position, position_error, charges, colors):
 def fixed_colors(
     scene: SceneColors, position: np.ndarray, position_error: float, charges: Charges, colors: np.ndarray
 ) -> None:
-    """Colours [N, 6] seen from one camera position: centre and radius by channel (design.md, C1, C3, S4).
+    """Write colours [N, 6] seen from one camera position: centre and radius by channel (design.md, C1, C3, S4).
 
     Args:
         scene: The Gaussians.
-        position: [3] world; ``position_error`` bounds what float evaluation and the set add to it.
+        position: [3] world; ``position_error`` bounds its error by float evaluation and by the set.
         charges: For the program's rounding.
         colors: The output.
     """
@@ -176,7 +174,7 @@ def fixed_colors(
 
 @njit(cache=True, error_model="numpy")
 def gathered(colors, numbers, alive, out):
-    """Rows ``alive`` of ``out`` [n, 6]: the ``colors`` of the Gaussians ``numbers`` [n]; the others are left as is."""
+    """Write the ``colors`` of the Gaussians ``numbers`` [n] to the rows ``alive`` of ``out`` [n, 6]; others stay."""
     for k in alive:
         i = numbers[k]
         for column in range(6):
@@ -186,7 +184,7 @@ def gathered(colors, numbers, alive, out):
 
 @njit(cache=True, error_model="numpy")
 def _set_directions(work, numbers, scene, position, origin, m):
-    """Forms 0 to 2 of ``work``, but for the rows of sums: from the camera to the means of the Gaussians ``numbers``."""
+    """Set forms 0 to 2 of ``work`` to the vectors from the camera to the means ``numbers``, without the rows of sums."""
     means = borrowed(scene.means)
     for axis in range(3):
         form = work[axis]
@@ -203,7 +201,7 @@ def _set_directions(work, numbers, scene, position, origin, m):
 
 @njit(cache=True, error_model="numpy")
 def _set_bands(work, numbers, filled, scratch, scene, shape):
-    """Forms 16 to 18 of ``work``: the three channels, from the directions; ``scratch.low``: squared lengths."""
+    """Set forms 16 to 18 of ``work`` to the three channels, from the directions; ``scratch.low``: squared lengths."""
     d, order, m = shape.dimensions, shape.order, shape.monomials
     sh, low, weights = borrowed(scene.sh), scratch.low, scratch.weights
     for channel in range(3):
@@ -274,7 +272,7 @@ def _clamp_channel(form, channel, numbers, filled, scratch, scene, charges, shap
 
 @njit(cache=True, error_model="numpy", nogil=True)
 def _moving_worker(counter_, indices, scene, position, origin, position_error, charges, shape, colors):
-    """One thread's Gaussians: the next chunk that none has taken yet; see `moving_colors`."""
+    """Do the chunks of Gaussians that no other thread has taken; see `moving_colors`."""
     counter, n, m = pointer(counter_), indices.shape[0], shape.monomials
     # 0-2 direction, 16-18 channels; in between what `line_colors` keeps
     work_ = np.empty((19, m + 3, LANES))
@@ -314,12 +312,11 @@ def moving_colors(
     indices: np.ndarray, scene: SceneColors, position: np.ndarray, origin: np.ndarray, position_error: float,
     charges: Charges, shape: FormShape, colors: np.ndarray,
 ) -> None:  # fmt: skip
-    """Colours over a cell in which the camera moves, as forms (design.md, C2, C3, S4).
+    """Write colours over a cell in which the camera moves, as forms (design.md, C2, C3, S4).
 
     ``indices`` [n, 2] are rows of ``colors`` and numbers of Gaussians in the scene. ``position`` [rows, 3] are forms,
-    of ``shape``, of the camera position, world, centred at ``origin`` [3] and off by at most ``position_error``, world
-    units. ``colors`` [., 3 (m + 1)] receives coefficients and radius by channel; ``charges`` are for the program's
-    rounding.
+    of ``shape``, of the camera position in the world, centred at ``origin`` [3], within ``position_error``. ``colors``
+    [., 3 (m + 1)] receives coefficients and radius by channel; ``charges`` are for the program's rounding.
     """
     run_in_chunks(
         _moving_worker, indices.shape[0], indices, scene, position, origin, position_error, charges, shape, colors

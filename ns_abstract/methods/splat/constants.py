@@ -25,8 +25,7 @@ class Rasteriser:
         near, far: Depths kept, both ends included (fully_fused_projection_fwd.cu:73).
         eps2d: Added to the diagonal of the projected covariance, square pixels (utils.cuh, add_blur).
         tile_size: Pixels on a tile's side; 0: every Gaussian reaches every pixel.
-        radius_sigmas: Radius in standard deviations of the longest axis
-            (fully_fused_projection_fwd.cu:165-167).
+        radius_sigmas: Radius in standard deviations of the longest axis (fully_fused_projection_fwd.cu:165-167).
         axis_sigmas: From 1.5 on: half-width and half-height of the box that meets tiles, at most this many standard
             deviations along the image's axes, and no more than an opacity above ``alpha_min`` reaches
             (ProjectionEWA3DGSFused.cu:164-184, IntersectTile.cu:55-77); 0: a square of the radius.
@@ -36,16 +35,16 @@ class Rasteriser:
         view_margin: The Jacobian is evaluated at most this fraction of the half field of view
             outside the image (utils.cuh:267-277); negative: no clamp.
         compensation_min: Least factor of the opacity in antialiased mode (Common.h:110).
-        eye_from_view: Colours are seen from -R^T t, with the view matrix (R, t), and not from the position that its
-            inverse holds (SphericalHarmonics.cuh:40-71).
+        eye_from_view: Colours are seen from -R^T t, with the view matrix (R, t), not from the position in its inverse
+            (SphericalHarmonics.cuh:40-71).
         alpha_min: Smaller alphas are skipped (rasterize_to_pixels_fwd.cu).
         alpha_max: Larger alphas are lowered to it.
-        transmittance_min: The Gaussian that would bring the transmittance to this or below is not
-            drawn, nor is any behind it; negative: there is no stop.
+        transmittance_min: The Gaussian that would bring the transmittance to this or below is not drawn, nor is any
+            behind it; negative: there is no early termination.
         background: Whether the scene's background shows through (else black).
         view_dependent: Whether colours use spherical harmonics beyond band 0.
-        alpha_negligible: Numerical cut-off where ``alpha_min`` is 0; what it drops is bounded and
-            added to the result.
+        alpha_negligible: Numerical cut-off where ``alpha_min`` is 0; the dropped alphas are bounded and added to the
+            result.
     """
 
     name: str
@@ -70,7 +69,7 @@ class Rasteriser:
 
     @property
     def work_tile(self) -> int:
-        """Side of the tiles that pictures are computed in."""
+        """Side of the tiles in which pictures are computed."""
         return self.tile_size or WORK_TILE
 
     @property
@@ -122,7 +121,7 @@ _RELEASES = {(1, 4): GSPLAT_1_4_0, (1, 5): GSPLAT_1_5_3, (1, 6): GSPLAT_1_6_0}
 
 
 def rasteriser_named(renderer: str | None = None, version: str | None = None) -> Rasteriser:
-    """The rules of "gsplat" (None) in a version of `VERSIONS` (None: 1.4.0), or of "paper", which has none."""
+    """Return the rules of "gsplat" (None) in a version of `VERSIONS` (None: 1.4.0), or of "paper", without versions."""
     if renderer in (None, "gsplat"):
         return VERSIONS[version or GSPLAT_1_4_0.version]
     return RASTERISERS[renderer]
@@ -163,7 +162,7 @@ class RasterRules(NamedTuple):
 
 
 def raster_rules(rasteriser: Rasteriser, antialiased: bool) -> RasterRules:
-    """The rasteriser's constants for kernels."""
+    """Return the rasteriser's constants for kernels."""
     r = rasteriser
     alpha_min = r.alpha_min if r.alpha_min > 0.0 else r.alpha_negligible
     return RasterRules(
