@@ -184,7 +184,7 @@ def gathered(colors, numbers, alive, out):
 
 @njit(cache=True, error_model="numpy")
 def _set_directions(work, numbers, scene, position, origin, m):
-    """Set forms 0 to 2 of ``work`` to the vectors from the camera to the means ``numbers``, without the rows of sums."""
+    """Set forms 0 to 2 of ``work`` to the vectors from the camera to the means ``numbers``, without rows of sums."""
     means = borrowed(scene.means)
     for axis in range(3):
         form = work[axis]

@@ -1,4 +1,4 @@
-"""Gaussians that share a pixel and may change places (design.md, O1)."""
+"""Pairs of Gaussians on a common pixel whose depth order is open within the cell (docs/dev/design.md, O1)."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from ns_abstract.methods.splat.reached_pixels import pixels_at, pixels_once
 
 
 class BlockList(NamedTuple):
-    """A block's list of Gaussians, nearest first, with pointers to their `ProjectedGaussians`.
+    """A block's Gaussians, nearest first, with pointers to their `ProjectedGaussians`.
 
     Attributes:
         numbers: [length] the Gaussians' rows.
@@ -22,7 +22,7 @@ class BlockList(NamedTuple):
         slope: [rows, 3] see `ViewingAxes.depth`.
         tied: See `ViewingAxes.tied`.
         colors: Of Gaussians, see `Colors.values`.
-        color_columns, color_rows: Columns of ``colors``, of which each channel has so many.
+        color_columns, color_rows: Columns of ``colors``, and of each channel in it.
         x0, y0: The block's first pixel.
         m: Coefficients of a form.
     """
@@ -47,7 +47,7 @@ class BlockList(NamedTuple):
 
 @njit(cache=True, error_model="numpy", forceinline=True)
 def block_list(numbers, place, inputs):
-    """The `BlockList` of the Gaussians ``numbers`` (rows of ``inputs.gaussians``) at a block's ``place``."""
+    """Return the `BlockList` of the Gaussians ``numbers`` (rows of ``inputs.gaussians``) at a block's ``place``."""
     gaussians, axes, colors = inputs.gaussians, inputs.axes, inputs.colors.values
     return BlockList(
         pointer(numbers), numbers.size, pointer(gaussians.record), gaussians.record.shape[1], pointer(gaussians.box),
@@ -58,14 +58,14 @@ def block_list(numbers, place, inputs):
 
 
 class DepthWindow(NamedTuple):
-    """How far apart in depth list positions may change places (O1).
+    """The distance in depth up to which list positions may change their order (O1).
 
     Attributes:
         room: Positions i, j keep their order where ``room |depth_i - depth_j| > radius_i + radius_j``; if not positive,
-            nothing is known.
+            no order is known.
         largest: Largest `ListEntries.depth_radius` of all but the few positions in ``far``.
-        far: How many these are.
-        farthest: Their largest one.
+        far: Number of these.
+        farthest: Their largest radius.
     """
 
     room: float
@@ -76,7 +76,7 @@ class DepthWindow(NamedTuple):
 
 @njit(cache=True, error_model="numpy", forceinline=True)
 def _uncertain(i, j, listed):
-    """Whether the depth order of Gaussians i and j, listed in this order, may be another in the cell (design.md, O1).
+    """Return whether Gaussians i and j, listed in this order, may have the other order in the cell (design.md, O1).
 
     Depths differ by the third row of the rotation times ``delta_i - delta_j``.
     """
@@ -99,7 +99,7 @@ def _uncertain(i, j, listed):
 
 @njit(cache=True, error_model="numpy", forceinline=True)
 def _same_color(i, j, listed):
-    """Whether Gaussians i and j surely have the same colour, so that their order changes nothing (design.md, O5)."""
+    """Return whether Gaussians i and j surely have the same colour, so that their order changes nothing (O5)."""
     first, second = (
         offset_by(listed.colors, i * listed.color_columns),
         offset_by(listed.colors, j * listed.color_columns),
@@ -114,7 +114,7 @@ def _same_color(i, j, listed):
 
 @njit(cache=True, error_model="numpy", forceinline=True)
 def _turn(slope, ray, m):
-    """By how much the depth of a point of unit depth on ``ray`` [3] changes over the cell, at most (design.md, O1)."""
+    """Return the largest change over the cell of the depth of a point of unit depth on ``ray`` [3] (design.md, O1)."""
     along = 0.0
     for k in range(1, m):
         along += abs(slope[k, 0] * ray[0] + slope[k, 1] * ray[1] + slope[k, 2] * ray[2])
@@ -123,13 +123,13 @@ def _turn(slope, ray, m):
 
 @njit(cache=True, error_model="numpy", forceinline=True)
 def _steadiness(along):
-    """Lower bound of one less the exact `_turn` (design.md, O1), of which a small one may be nothing but rounding."""
+    """Return a lower bound of one less the exact `_turn`; a small result may be rounding alone (design.md, O1)."""
     return 1.0 - along - TURN_ROOM
 
 
 @njit(cache=True, error_model="numpy")
 def depth_radii(numbers, gaussians, slope, ray, m, entries):
-    """How far in depth each entry may move against the block's central ray (design.md, O1).
+    """Compute how far in depth each entry may move relative to the block's central ray (design.md, O1).
 
     Fills ``entries.depth_radius`` and ``entries.depth``; returns `DepthWindow.room` and `DepthWindow.largest`.
     """
@@ -169,10 +169,10 @@ def depth_radii(numbers, gaussians, slope, ray, m, entries):
 
 @njit(cache=True, error_model="numpy", forceinline=True)
 def find_pairs(k, found, pixels, listed, entries, per_pixel, window, reordering, count):
-    """Append the pairs (k, later entry) that share a pixel and are of uncertain order; widen ``first``, ``last``.
+    """Append the pairs (k, later entry) on a common pixel with open order; widen ``first``, ``last``.
 
     Pairs of one colour are not appended (O5). ``pixels`` in the lanes ``found`` are those of k. Returns the number of
-    pairs, or -1 where there is no room for them.
+    pairs, or -1 if they do not fit.
     """
     radii, deep, far, pairs = entries.depth_radius, entries.depth, entries.far, reordering.pairs
     i = listed.numbers[k]

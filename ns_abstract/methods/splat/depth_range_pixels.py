@@ -1,6 +1,7 @@
-"""Pixels over sub-boxes of a cell from the ranges of the Gaussians' depths (design.md, B14).
+"""Bounds of pixels over sub-boxes of a cell from the ranges of the Gaussians' depths (docs/dev/design.md, B14).
 
-SIMD lanes are eight sub-boxes.
+A fragment is surely in front of another if the far end of its depth range is nearer than the other's near end. SIMD
+lanes are eight sub-boxes.
 """
 
 from __future__ import annotations
@@ -56,7 +57,7 @@ _ALL = 255
 
 @dataclass(frozen=True)
 class DepthRangeTuning:
-    """How far fragments are looked at before bands are chosen. It does not decide whether a bound holds."""
+    """How many fragments are considered before bands are chosen; soundness does not depend on it."""
 
     #: Transmittance at the middle pose behind which they are not.
     least_transmittance: float = 2.0**-4
@@ -66,18 +67,18 @@ _LEAST_TRANSMITTANCE = DepthRangeTuning.least_transmittance
 
 
 class _Work(NamedTuple):
-    """Memory for the fragments of one pixel, nearest end of their depths first; [room] where nothing else is said.
+    """Memory for the fragments of one pixel, sorted by the near ends of their depths; [room] unless stated otherwise.
 
     Attributes:
         sets: The set of the block's pixels that each of its Gaussians reaches.
         numbers: The rows of the Gaussians that reach the pixel.
         is_drawn: Whether alpha may reach the threshold.
-        near, far: Ends of the depth (`_depth_ranges`); ``far`` in its own order, which ``by_far`` tells.
-        by_far: The fragments, farthest ends last.
+        near, far: Ends of the depth (`_depth_ranges`); ``far`` is sorted by itself, in the order ``by_far``.
+        by_far: The fragments sorted by far ends.
         strips: The sets of strips in which alpha may reach the threshold.
-        below: How many bands the colour is beyond.
-        share: Part of the next band that it reaches, or 0.
-        low: [room, 2, parts] least alpha over the sub-boxes, and most transmittance at a stop there.
+        below: Number of bands that the colour exceeds.
+        share: Fraction of the next band that it reaches, or 0.
+        low: [room, 2, parts] least alpha over the sub-boxes, and largest transmittance at an early termination there.
         colors, weights, keys: Scratch.
         order: Scratch.
     """
@@ -100,7 +101,7 @@ class _Work(NamedTuple):
 
 @njit(cache=True, error_model="numpy")
 def _new_work(room):
-    """`_Work` for lists of ``room`` Gaussians, but for what lanes are."""
+    """Return `_Work` for lists of ``room`` Gaussians, without ``low``."""
     return (
         np.empty(room, np.int64), np.empty(room, np.uint32), np.empty(room, np.int64), np.empty(room), np.empty(room),
         np.empty(room, np.int64), np.empty(room, np.int64), np.empty(room, np.int64), np.empty(room),
@@ -111,7 +112,7 @@ def _new_work(room):
 
 @njit(cache=True, error_model="numpy")
 def _work_of(rooms, low):
-    """The `_Work` in ``rooms`` and ``low``, which the caller keeps alive for as long as it is used."""
+    """Return the `_Work` in ``rooms`` and ``low``, which the caller keeps alive while it is used."""
     first, last = rooms
     return _Work(
         first[0], first[1], first[2], first[3], first[4], first[5], first[6], first[7], first[8],
@@ -121,7 +122,7 @@ def _work_of(rooms, low):
 
 @njit(cache=True, error_model="numpy", forceinline=True)
 def _strips_reached(values, at, strips, inputs):
-    """The set of strips in which the fragment at ``at`` may reach the threshold (design.md, B4, B12, B14)."""
+    """Return the set of strips in which the fragment at ``at`` may reach the alpha threshold (B4, B12, B14)."""
     axes = part_axes(inputs.shape)
     ends = at + exponent_ends(inputs.shape.monomials)
     e1, e2, e = values[ends], values[ends + 1], at + EXPONENT
@@ -152,7 +153,7 @@ def _strips_reached(values, at, strips, inputs):
 def _depth_ranges(count, x, y, inputs, block, work):
     """Sort the ``count`` Gaussians of the pixel at (x, y) by the near ends of their depths (design.md, O1, B14).
 
-    Where the far end of one is below the near end of another, it is drawn before it at every pose.
+    A Gaussian whose far end is nearer than another's near end is in front of it at every pose.
     """
     numbers, near, far = work.numbers, work.near, work.far
     ray_at(x + 0.5, y + 0.5, inputs, block.ray)
@@ -178,7 +179,7 @@ def _depth_ranges(count, x, y, inputs, block, work):
 
 @njit(cache=True, error_model="numpy", forceinline=True)
 def _compute_alphas(start, q, place, listed, inputs, block, work):
-    """Compute the alphas of the next fragments of pixel q; returns of how many they are computed then."""
+    """Compute the alphas of the next fragments of pixel q; return the number of fragments with alphas."""
     some = min(BATCH, listed.length - start)
     place_batch(start, some, signed(1 << q), listed, inputs, block)
     find_alphas(start, some, signed(start), place, listed, inputs, block)
@@ -189,9 +190,9 @@ def _compute_alphas(start, q, place, listed, inputs, block, work):
 
 @njit(cache=True, error_model="numpy")
 def _compute_visible(q, place, listed, inputs, block, work):
-    """Compute blending weights at the middle pose while the transmittance is high; returns of how many fragments.
+    """Compute blending weights at the middle pose while the transmittance is high; return the number of fragments.
 
-    Nothing that is proved depends on them. The background is one more.
+    Soundness does not depend on them. The background counts as one more fragment.
     """
     values, width = block.fragments.values, block.fragments.width
     ends = exponent_ends(inputs.shape.monomials)
@@ -214,10 +215,9 @@ def _compute_visible(q, place, listed, inputs, block, work):
 
 @njit(cache=True, error_model="numpy")
 def _bound_end(q, computed, goal, place, listed, inputs, block, strips, end, work, sums, out):
-    """Write the lower or upper bound that is ``end`` of pixel q over each sub-box (design.md, B14).
+    """Write one end (lower or upper) of pixel q over each sub-box; return the number of fragments with alphas (B14).
 
-    Fragments are composited nearest depth first; each occludes what follows once its farthest depth is passed. Returns
-    of how many fragments alphas are computed then.
+    Fragments are composited nearest depth first; each occludes the following ones once its farthest depth is passed.
     """
     values, width, parts, levels = block.fragments.values, block.fragments.width, inputs.shape.parts, sums.levels
     count = listed.length
@@ -258,7 +258,7 @@ def _bound_end(q, computed, goal, place, listed, inputs, block, strips, end, wor
 
 @njit(cache=True, error_model="numpy")
 def _bound_pixel(q, count, goals, place, inputs, block, strips, color_ends, work, sums, out):
-    """Write those ends of pixel q of a block, which ``count`` Gaussians reach, that have ``goals`` (design.md, B14)."""
+    """Write the ends with ``goals`` of pixel q of a block, which ``count`` Gaussians reach (design.md, B14)."""
     _depth_ranges(count, place.x0 + q % BLOCK, place.y0 + q // BLOCK, inputs, block, work)
     listed = block_list(borrowed(work.numbers[:count]), place, inputs)
     for k in range(count):
@@ -282,7 +282,7 @@ def _bound_pixel(q, count, goals, place, inputs, block, strips, color_ends, work
 
 @njit(cache=True, error_model="numpy")
 def _bound_block(numbers, goals, place, inputs, block, strips, color_ends, work, sums, out):
-    """Write the ends of the wanted pixels of a block that have ``goals`` over each sub-box (design.md, B14)."""
+    """Write the ends with ``goals`` of a block's requested pixels over each sub-box (design.md, B14)."""
     take_motion(place, inputs, block)
     listed, sets, pixels = block_list(numbers, place, inputs), work.sets, signed(place.wanted)
     for k in range(listed.length):
@@ -305,7 +305,7 @@ def _bound_block(numbers, goals, place, inputs, block, strips, color_ends, work,
 
 @njit(cache=True, error_model="numpy", nogil=True)
 def _depth_range_worker(share, lists, pixels, goals, inputs, strips, color_ends, out):
-    """One thread's tiles; see `ThreadShare` and `depth_range_stage`."""
+    """Do one thread's tiles; see `ThreadShare` and `depth_range_stage`."""
     sequence, counter = borrowed(share.sequence), pointer(share.counter)
     inputs = borrowed_inputs(inputs)
     strips = Strips(pointer(strips.middles), pointer(strips.half), strips.room)
@@ -356,18 +356,18 @@ def depth_range_stage(
     lists: TileLists, pixels: np.ndarray, goals: np.ndarray, inputs: PixelInputs, strips: Strips,
     color_ends: ColorEnds, threads: int, out: np.ndarray,
 ) -> None:  # fmt: skip
-    """Ends of pixels of the tiles ``lists.wanted`` over each sub-box of a cell (design.md, B14).
+    """Write ends of pixels of the tiles ``lists.wanted`` over each sub-box of a cell (design.md, B14).
 
     Args:
         lists: Of all tiles of the image.
-        pixels: [t, blocks] the set of the pixels of each block that are wanted, blocks row by row.
-        goals: [t, side, side, 6] values of the least of three channels, then of the most. Nothing else matters than on
-            which side of its goal an end is; infinite: all does; NaN: the end is not wanted.
-        inputs: Of the cell, which has parts: the sub-boxes.
+        pixels: [t, blocks] the set of each block's requested pixels, blocks row by row.
+        goals: [t, side, side, 6] goals for the least of three channels, then the greatest. Only the side of its goal on
+            which an end lies matters; infinite: the end itself is needed; NaN: it is not needed.
+        inputs: Of the cell, whose parts are the sub-boxes.
         strips: Of eight sub-boxes each.
         color_ends: Of the Gaussians.
         threads: Number of threads.
-        out: [t, side, side, 6, parts] receives the ends that are wanted. What is no number bounds nothing.
+        out: [t, side, side, 6, parts] receives the ends. NaN bounds nothing.
     """
     run_by_tiles(
         _depth_range_worker, longest_first(lists.wanted, lists.offsets), threads, lists, pixels, goals, inputs,

@@ -1,6 +1,6 @@
-"""Expected depth and accumulation of a block's pixels (design.md, D1-D4).
+"""Expected depth and accumulation of a block's pixels (docs/dev/design.md, D1-D4).
 
-The fragments are those that `blend` shades; their colours are depths, in the fourth lane of the palette, and 1 in the
+The fragments are those that `blend` composites; their colours are the depth, in the palette's fourth lane, and 1 in the
 first lane for the accumulation.
 """
 
@@ -33,11 +33,11 @@ ACCUMULATION_LOW, ACCUMULATION_HIGH, DEPTH_LOW, DEPTH_HIGH = range(4)
 
 
 class _Span(NamedTuple):
-    """Depths of a pixel's fragments against the reference, and without it.
+    """Differences of a pixel's depths to their reference, and their magnitude.
 
     Attributes:
         nearest, farthest: Least and greatest difference.
-        largest: Greatest size of a depth, against what all have in common.
+        largest: Greatest magnitude of a depth relative to the common form.
     """
 
     nearest: float
@@ -47,7 +47,7 @@ class _Span(NamedTuple):
 
 @njit(cache=True, error_model="numpy", forceinline=True)
 def _set_reference(begin, end, fragments, palette, reference, m):
-    """Write the mean of the depths' polynomials of a pixel, weighted as in the middle of the cell (design.md, D2)."""
+    """Write the reference of a pixel: the mean of its depths' polynomials, weighted as at the cell's middle (D2)."""
     values, colors, forms = fragments.values, palette.values, palette.forms
     for k in range(m):
         reference[k] = 0.0
@@ -66,9 +66,9 @@ def _set_reference(begin, end, fragments, palette, reference, m):
 
 @njit(cache=True, error_model="numpy", forceinline=True)
 def _shift_depths(begin, end, block, reference, m):
-    """Fill the palette ``block.shifted`` for a pixel's fragments: depths against the reference, and 1; its `_Span`.
+    """Fill the palette ``block.shifted`` with a pixel's depths less the reference, and 1; return its `_Span`.
 
-    What reordering changes in colours is taken out of their rows of moves.
+    The changes of colours by reordering are removed from their rows of moves.
     """
     fragments, palette, moves = block.fragments, block.palette, block.reordering.moves
     forms, colors, shifted = palette.forms, palette.values, block.shifted.values
@@ -102,7 +102,7 @@ def _shift_depths(begin, end, block, reference, m):
 
 @njit(cache=True, error_model="numpy", forceinline=True)
 def _range(polynomial, order, m):
-    """Range over the box of a polynomial of ``m`` coefficients, rounded outward (design.md, A4)."""
+    """Return the range over the box of a polynomial of ``m`` coefficients, rounded outward (design.md, A4)."""
     middle, size = polynomial[0], 0.0
     for k in range(1, m):
         size += abs(polynomial[k])
@@ -119,10 +119,11 @@ def _range(polynomial, order, m):
 
 @njit(cache=True, error_model="numpy", forceinline=True)
 def _weighted_mean(polynomials, radius, low, high, total_low, total_high, order, m):
-    """Bounds of a sum over the accumulation, added to a polynomial (design.md, D3).
+    """Return bounds of a polynomial plus a weighted sum divided by the accumulation (design.md, D3).
 
-    ``polynomials`` [2 m] are that one, which is overwritten, and that of the sum, of ``radius`` beside its own. The sum
-    lies between ``low`` and ``high``, the accumulation, which is not 0, between ``total_low`` and ``total_high``.
+    ``polynomials`` [2 m] are the polynomial, which is overwritten, and that of the sum, with the sum's ``radius``. The
+    sum lies between ``low`` and ``high``; the accumulation, which is positive, between ``total_low`` and
+    ``total_high``.
     """
     base_low, base_high = _range(polynomials, order, m)
     first_low = base_low + low / (total_low if low < 0.0 else total_high)
@@ -142,7 +143,7 @@ def _weighted_mean(polynomials, radius, low, high, total_low, total_high, order,
 
 @njit(cache=True, error_model="numpy", forceinline=True)
 def _blend_depths(begin, end, block, polynomials, by_lane, order, m):
-    """Blend a pixel's shifted depths and accumulation: polynomials in ``polynomials``, then ends and radii by lane."""
+    """Composite a pixel's shifted depths and accumulation: writes polynomials, then ends and radii by lane."""
     fragments, moves = block.fragments, block.reordering.moves
     if order == 2:
         blended = blend_quadratic(begin, end, fragments, block.shifted, moves, polynomials, block.crossings, False)
@@ -166,10 +167,10 @@ def _write(layers, total_low, total_high, low, high):
 
 @njit(cache=True, error_model="numpy", forceinline=True)
 def _expected_depth(result, radius, span, low, high, total_low, total_high, rounding, common, charges, order, m):
-    """Bounds of the expected depth where something is drawn, infinite above where they are not finite (D3, D4).
+    """Return bounds of the expected depth where something is drawn; the upper one is infinite if not finite (D3, D4).
 
-    ``result`` holds the reference and behind it the polynomial of the sum of weights times depths against it, of
-    ``radius`` beside its own; that sum lies between ``low`` and ``high``. Overwrites ``result``.
+    ``result`` holds the reference, then the polynomial of the sum of weights times shifted depths, with its ``radius``;
+    that sum lies between ``low`` and ``high``. Overwrites ``result``.
     """
     magnitude = 0.0
     for k in range(m):
@@ -192,9 +193,9 @@ def _expected_depth(result, radius, span, low, high, total_low, total_high, roun
 
 @njit(cache=True, error_model="numpy")
 def shade_layers(pixels, left, above, block, inputs, bounds):
-    """Write `PixelBounds.layers` of those ``pixels`` of a block that `shade` has shaded (design.md, D1-D4).
+    """Write `PixelBounds.layers` of the ``pixels`` of a block that `shade` has composited (design.md, D1-D4).
 
-    Reads the depths in lane `DEPTH` of the palette, and changes rows of moves, which are of no use afterwards.
+    It reads the depths in lane `DEPTH` of the palette, and changes rows of moves, which are not used afterwards.
     """
     fragments, t = block.fragments, block.sums
     per_pixel, charges, cutoffs = fragments.per_pixel, inputs.charges, inputs.cutoffs

@@ -32,21 +32,21 @@ class StoredGaussians:
     sh: Float32Array
 
     def kept(self, rows: NDArray[np.bool_]) -> StoredGaussians:
-        """The rows where ``rows`` [N] is true."""
+        """Return the rows where ``rows`` [N] is true."""
         return StoredGaussians(**{name: np.ascontiguousarray(value[rows]) for name, value in vars(self).items()})
 
 
 def drawable(
     rows: StoredGaussians, file: Path, fields: dict[str, str], drop_nan: bool = False
 ) -> tuple[StoredGaussians, dict[str, Any]]:
-    """Return the Gaussians that gsplat may draw, and the notes about those left out (design.md, Limits).
+    """Return the Gaussians that gsplat may draw, and notes about those left out (docs/dev/design.md, Limits).
 
-    gsplat draws no Gaussian of which the mean or the quaternion is not finite, or a scale is NaN: its radius is NaN,
-    which becomes the integer 0. An opacity of NaN is drawn: min(0.999, NaN) is 0.999 in CUDA. Infinite scales and
-    colours that are not finite are drawn, too. Logits of opacities may be infinite, and logarithms of scales -inf.
-    ``fields``: names in the file of means, scales, quats, opacities and colours. ``drop_nan``: whether Gaussians that
-    would be drawn with values that are not finite are left out. Raises InputError where a Gaussian cannot be bounded,
-    or none is left.
+    gsplat draws no Gaussian whose mean or quaternion is not finite, or with a scale of NaN: its radius is NaN, which
+    becomes the integer 0. An opacity of NaN is drawn: min(0.999, NaN) is 0.999 in CUDA. Infinite scales and colours
+    that are not finite are drawn, too. Logits of opacities may be infinite, and logarithms of scales -inf. ``fields``:
+    names in the file of means, scales, quats, opacities and colours. ``drop_nan``: whether Gaussians that would be
+    drawn with values that are not finite are left out. Raises InputError where a Gaussian cannot be bounded, or none is
+    left.
     """
     with np.errstate(over="ignore", under="ignore", invalid="ignore"):
         scales = np.exp(rows.log_scales.astype(np.float64))
@@ -90,7 +90,7 @@ def drawable(
 
 
 def coordinates_note(means: Float32Array, log_scales: Float32Array) -> tuple[str, ...]:
-    """A note where float32 resolves coordinates by less than a thousandth of the scene's size; else none."""
+    """Return a note if float32 resolves coordinates by less than a thousandth of the scene's size; else nothing."""
     if means.shape[0] == 0:
         return ()
     low, high = np.quantile(means.astype(np.float64), (0.05, 0.95), axis=0)
@@ -107,7 +107,7 @@ def coordinates_note(means: Float32Array, log_scales: Float32Array) -> tuple[str
 
 
 def _all(good: NDArray[np.bool_]) -> NDArray[np.bool_]:
-    """[N] whether all values of a row are good."""
+    """Return [N] whether all values of a row are good."""
     return np.asarray(good.reshape(good.shape[0], -1).all(axis=1))
 
 

@@ -1,4 +1,4 @@
-"""What the cells around a cell show: few Gaussians may be seen on the pixels that are wanted (design.md, U8)."""
+"""Contexts of enclosing cells: the few Gaussians that are visible on the requested pixels (docs/dev/design.md, U8)."""
 
 from __future__ import annotations
 
@@ -9,11 +9,11 @@ import numpy as np
 
 @dataclass(frozen=True)
 class VisibleContext:
-    """The Gaussians that a cell may show on the requested pixels, reused for the cells inside it.
+    """The Gaussians that a cell may show on the requested pixels, reused for cells inside it.
 
     Attributes:
         visible: [n] scene indices.
-        reach: [n, 4] int32 first and past columns, first and past rows of the pixels on which they may be seen.
+        reach: [n, 4] int32 first and past columns, first and past rows of the pixels on which they may be visible.
     """
 
     visible: np.ndarray
@@ -21,7 +21,7 @@ class VisibleContext:
 
     @property
     def nbytes(self) -> int:
-        """Memory that it holds."""
+        """The bytes that it holds."""
         return self.visible.nbytes + self.reach.nbytes
 
     @property
@@ -35,7 +35,7 @@ class EnclosingContext(VisibleContext):
     """The context of an enclosing cell, on all pixels.
 
     Attributes:
-        counts: [H, W] how many of the Gaussians may be seen on each pixel.
+        counts: [H, W] number of the Gaussians that may be visible on each pixel.
     """
 
     counts: np.ndarray

@@ -27,12 +27,13 @@ WORKSPACE = 18
 
 @njit(cache=True, error_model="numpy")
 def form_colors(w, rows, low, sh, weights, indices, degree, m):
-    """Add the bands from 1 to ``degree`` to the colours of eight Gaussians.
+    """Add bands 1 to ``degree`` to the colours of eight Gaussians.
 
     Args:
         w: Scratch for `WORKSPACE` forms.
-        rows: Rows [., LANES], flat, from the first of the eight lanes on: forms of m + 3 rows each, 0 to 2 the
-            directions, not of unit length, 16 to 18 the channels, which are added to but for their rows of sums.
+        rows: Rows [., LANES], flat, from the first of the eight lanes on: forms of m + 3 rows each. Forms 0 to 2 are
+            the directions, not of unit length; forms 16 to 18 are the channels, which are added to, without rows of
+            sums.
         low: Receives lower bounds of the squared lengths, from the first of the eight on.
         sh: [N, K, 3] coefficients; ``indices`` [8] the Gaussians' numbers.
         weights: [8] scratch.
@@ -58,7 +59,7 @@ def form_colors(w, rows, low, sh, weights, indices, degree, m):
 
 @njit(cache=True, error_model="numpy", forceinline=True)
 def _accumulate(w, target, form, weight, m):
-    """``target += weight * form``, but for the rows of sums."""
+    """Do ``target += weight * form``, without the rows of sums."""
     for k in range(m):
         store(w, target + 8 * k, fma(weight, load8(w, form + 8 * k), load8(w, target + 8 * k)))
     weight = abs(weight)
@@ -70,7 +71,7 @@ def _accumulate(w, target, form, weight, m):
 
 @njit(cache=True, error_model="numpy")
 def _directions(w, low, degree, m):
-    """Unit directions and their products from the directions."""
+    """Compute unit directions and their products from the directions."""
     one = size(m)
     spare, length, inverse = _SPARE * one, _LENGTH * one, _INVERSE * one
     square(w, _DX * one, length, m)
@@ -108,7 +109,7 @@ def _scaled(w, a, s, shift, out, m):
 
 @njit(cache=True, error_model="numpy")
 def _basis(w, k, m):
-    """Basis function ``k`` >= 1, from the products that `_directions` leaves."""
+    """Compute basis function ``k`` >= 1 from the products of `_directions`."""
     one = size(m)
     x, y, z, z2, spare, out = _X * one, _Y * one, _Z * one, _Z2 * one, _SPARE * one, _BASIS * one
     c1, s1, c2, s2 = _C1 * one, _S1 * one, _C2 * one, _S2 * one

@@ -1,4 +1,4 @@
-"""Projection of Gaussians over cells of any number of parameters (design.md, G4-G9): forms of eight at a time."""
+"""Projects Gaussians over cells of any number of parameters, eight forms at a time (docs/dev/design.md, G4-G9)."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ WORKSPACE = 30
 
 @njit(cache=True, error_model="numpy")
 def rotate(w, rotation, r, v, offset, shifted, spread, out, shape):
-    """Row ``r`` of the rotation times exact ``v`` (three), plus the offset's if ``shifted``, widened by ``spread``.
+    """Compute row ``r`` of the rotation times an exact vector ``v``, plus the offset if ``shifted``, within ``spread``.
 
     ``rotation`` [rows, 9] and ``offset`` [rows, 3], both flat, are the pose's forms.
     """
@@ -63,7 +63,7 @@ def rotate(w, rotation, r, v, offset, shifted, spread, out, shape):
 
 @njit(cache=True, error_model="numpy", forceinline=True)
 def _keep_bounds(w, a, s, low, high, q, m):
-    """Write the bounds of a form to two rows; returns them."""
+    """Write the bounds of a form to two rows, and return them."""
     bottom, top = bounds(w, a, m)
     store(s, low + q, bottom)
     store(s, high + q, top)
@@ -72,7 +72,7 @@ def _keep_bounds(w, a, s, low, high, q, m):
 
 @njit(cache=True, error_model="numpy", forceinline=True)
 def _pixels(w, a, z, ratio, focal, out, m):
-    """``focal a - (focal ratio) z``, which vanishes at the middle of the cell: a pixel offset times depth.
+    """Compute a pixel offset times depth, ``focal a - (focal ratio) z``, which vanishes at the middle of the cell.
 
     ``ratio`` is a form; returns the focal length times its centre.
     """
@@ -89,7 +89,7 @@ def _pixels(w, a, z, ratio, focal, out, m):
 
 @njit(cache=True, error_model="numpy")
 def _lower(w, a, b, out, m):
-    """``out -= a b``."""
+    """Do ``out -= a b``."""
     # the subtraction's own rounding, for what it starts from
     store(w, out + 8 * m, load8(w, out + 8 * m) + SUM_ROUNDING * magnitude(w, out, m))
     add_product(w, a, b, -1.0, out, m)
@@ -105,7 +105,10 @@ def _keep(w, a, s, f, q, m):
 
 @njit(cache=True, error_model="numpy", forceinline=True)
 def _project_means(w, s, rotation, offset, camera, q, shape):
-    """Camera coordinates, ratios u = x / z, v = y / z, and pixel offsets times depth: _X .. _DY; bounds of u and v."""
+    """Compute camera coordinates, ratios u = x / z, v = y / z, and pixel offsets times depth: _X .. _DY.
+
+    Returns bounds of u and v.
+    """
     m = shape.monomials
     one = size(m)
     x, y, z, inverse, u, v = _X * one, _Y * one, _Z * one, _RZ * one, _U * one, _V * one
@@ -127,7 +130,7 @@ def _project_means(w, s, rotation, offset, camera, q, shape):
 
 @njit(cache=True, error_model="numpy", forceinline=True)
 def _clamp_ratios(w, u_range, v_range, camera, margin, m):
-    """The Jacobian's clamped ratios."""
+    """Clamp the ratios that the Jacobian is evaluated at."""
     fx, fy, cx, cy, width, height = camera
     one = size(m)
     extra = margin * 0.5 * width / fx
@@ -138,7 +141,7 @@ def _clamp_ratios(w, u_range, v_range, camera, margin, m):
 
 @njit(cache=True, error_model="numpy", forceinline=True)
 def _project_axes(w, s, rotation, offset, q, shape):
-    """w = R B, then n0 = w0 - u w2, n1 = w1 - v w2: _N0 .. _N5."""
+    """Compute w = R B, then n0 = w0 - u w2 and n1 = w1 - v w2: _N0 .. _N5."""
     m = shape.monomials
     one = size(m)
     deep = _W2 * one
@@ -157,10 +160,10 @@ def _project_axes(w, s, rotation, offset, q, shape):
 
 @njit(cache=True, error_model="numpy", forceinline=True)
 def _covariance(w, s, camera, eps2d, q, m):
-    """The covariance times z^2 and its determinant times z^4, blurred, and the latter without: _A, _B, _C, _DET, _K.
+    """Compute the blurred covariance times z^2, and determinants times z^4 with and without blur: _A, _B, _C, _DET, _K.
 
-    a' = fx^2 |n0|^2 + eps z^2, c' = fy^2 |n1|^2 + eps z^2, b' = fx fy n0.n1, and, of sums of squares only,
-    det' = fx^2 fy^2 |n0 x n1|^2 + eps z^2 (fx^2 |n0|^2 + fy^2 |n1|^2) + eps^2 z^4.
+    a' = fx^2 |n0|^2 + eps z^2, c' = fy^2 |n1|^2 + eps z^2, b' = fx fy n0.n1, and, of sums of squares only, det' = fx^2
+    fy^2 |n0 x n1|^2 + eps z^2 (fx^2 |n0|^2 + fy^2 |n1|^2) + eps^2 z^4.
     """
     one = size(m)
     a, b, c, det, k, z2 = _A * one, _B * one, _C * one, _DET * one, _K * one, _T2 * one
@@ -207,7 +210,7 @@ def _covariance(w, s, camera, eps2d, q, m):
 
 @njit(cache=True, error_model="numpy", forceinline=True)
 def _compensate(w, s, q, m):
-    """K = -log(compensation), compensation^2 = |n0 x n1|^2 / det', and bounds of the latter."""
+    """Compute K = -log(compensation), with compensation^2 = |n0 x n1|^2 / det', and bounds of the latter."""
     one = size(m)
     k, t0, t1 = _K * one, _T0 * one, _T1 * one
     reciprocal(w, _DET * one, t0, m)
@@ -220,7 +223,7 @@ def _compensate(w, s, q, m):
 
 @njit(cache=True, error_model="numpy", forceinline=True)
 def _whiten(w, s, q, m):
-    """The forms of a record: P = P' z, Q = Q' z, S = S' z, W1 = P' X^ - Q' Y^, W2 = S' Y^."""
+    """Compute the forms of a record: P = P' z, Q = Q' z, S = S' z, W1 = P' X^ - Q' Y^, W2 = S' Y^."""
     one = size(m)
     z, p, across, root = _Z * one, _P * one, _Q * one, _S * one
     t0 = _T0 * one
@@ -240,7 +243,7 @@ def _whiten(w, s, q, m):
 
 @njit(cache=True, error_model="numpy", forceinline=True)
 def _factor(w, m):
-    """The inverse covariance's factors S' = 1/sqrt(c'), P' = sqrt(c'/det'), Q' = P' b'/c': _S, _P, _Q."""
+    """Compute the factors of the inverse covariance, S' = 1/sqrt(c'), P' = sqrt(c'/det'), Q' = P' b'/c': _S, _P, _Q."""
     one = size(m)
     b, c, p, root, t0, t1 = _B * one, _C * one, _P * one, _S * one, _T0 * one, _T1 * one
     reciprocal_square_root(w, c, root, m)
@@ -254,11 +257,10 @@ def _factor(w, m):
 
 @njit(cache=True, error_model="numpy")
 def project_forms(w, s, rotation, offset, camera, rules, shape):
-    """`line_projection.project_line` with forms of order 1 in any number of parameters, and its `compensate_line`.
+    """Do `line_projection.project_line` and its `compensate_line` with forms of order 1 in any number of parameters.
 
-    See design.md, G1, G4.
-
-    ``w`` is scratch for `WORKSPACE` forms; the forms of a record go to the rows from FP, m + 1 each.
+    See design.md, G1, G4. ``w`` is scratch for `WORKSPACE` forms; the forms of a record go to the rows from FP, m + 1
+    each.
     """
     m = shape.monomials
     for q in range(0, LANES, 8):

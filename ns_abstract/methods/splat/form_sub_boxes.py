@@ -18,7 +18,7 @@ from ns_abstract.methods.splat.threshold_crossings import (
 
 @njit(cache=True, error_model="numpy", forceinline=True)
 def _undecided(foretold, levels):
-    """Whether one of ``levels`` lies between the ends of a channel in ``foretold`` [8], or there are none."""
+    """Return whether one of ``levels`` lies between a channel's ends in ``foretold`` [8], or there are no levels."""
     if levels.size == 0:
         return True
     for channel in range(3):
@@ -30,10 +30,11 @@ def _undecided(foretold, levels):
 
 @njit(cache=True, error_model="numpy")
 def bound_sub_boxes(count, limit, moved, crossings, inputs, out):
-    """Bounds of three channels, whose blends `set_blend` wrote, over each sub-box of the cell (design.md, B13).
+    """Write bounds of three channels over each sub-box of the cell, from the blends of `set_blend` (design.md, B13).
 
-    ``count`` fragments may be skipped, which lowers and raises the channels by at most ``moved`` [8]; a fragment surely
-    is skipped below alpha ``limit``. ``out`` is `PixelBlock.part_ends`, which receives them from `PART_ENDS` on.
+    ``count`` fragments may be skipped, which lowers and raises the channels by at most ``moved`` [8]; a fragment is
+    surely skipped below alpha ``limit``. ``out`` is `PixelBlock.part_ends`, which receives the bounds from `PART_ENDS`
+    on.
     """
     parts, d, boxes = inputs.parts, inputs.shape.dimensions, inputs.shape.sub_boxes
     columns = crossing_columns(count)

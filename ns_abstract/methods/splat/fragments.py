@@ -1,7 +1,7 @@
-"""Collect the fragments of a block of pixels, nearest first, with uncertain depth orders and early termination.
+"""Collects the fragments of a block of pixels, nearest first, with open depth orders and early termination.
 
-Gaussian by Gaussian, `collect_fragments` finds the pixels that it may reach and its alpha there, keeps what may
-contribute, and notes which Gaussians that share a pixel may change places (design.md, B5-B6, O1).
+Gaussian by Gaussian, `collect_fragments` finds the pixels that it may reach and its alpha there, stores what may
+contribute, and records which Gaussians on a common pixel may change their order (docs/dev/design.md, B5-B6, O1).
 """
 
 from __future__ import annotations
@@ -47,7 +47,7 @@ GROW = -2
 
 
 class _EarlyTermination(NamedTuple):
-    """Bounds on the transmittance of early termination, the transmittance below which tracking ends, and rounding."""
+    """Bounds of the transmittance at early termination, the transmittance below which lists end, and rounding."""
 
     low: float
     high: float
@@ -58,7 +58,7 @@ class _EarlyTermination(NamedTuple):
 
 @njit(cache=True, error_model="numpy", forceinline=True)
 def _start(numbers, inputs, block):
-    """Reset a block's pixels and list positions; returns the `DepthWindow`."""
+    """Reset a block's pixels and list positions; return the `DepthWindow`."""
     entries, per_pixel, lengths = block.entries, block.fragments.per_pixel, block.fragments.lengths
     for q in range(PIXELS):
         per_pixel[TLO + q] = 1.0
@@ -91,7 +91,7 @@ def _start(numbers, inputs, block):
 
 @njit(cache=True, error_model="numpy")
 def _still_live(lanes, pixels, live):
-    """Those lanes of ``found`` whose pixel is in ``live``."""
+    """Return those ``lanes`` whose pixel is in the set ``live``."""
     left = 0
     while lanes != 0:
         lane = lowest_bit(lanes)
@@ -103,7 +103,7 @@ def _still_live(lanes, pixels, live):
 
 @njit(cache=True, error_model="numpy", forceinline=True)
 def _append(number, q, k, t_low, t_high, fragments):
-    """Append fragment ``number`` to pixel q's list, with the light that it leaves; returns its place there."""
+    """Append fragment ``number`` to pixel q's list, with the transmittance behind it; return its position there."""
     per_pixel, lists, light = fragments.per_pixel, fragments.lists, fragments.light
     count = fragments.lengths[q]
     entry = q * fragments.capacity + count
@@ -120,7 +120,7 @@ def _append(number, q, k, t_low, t_high, fragments):
 
 @njit(cache=True, error_model="numpy")
 def _keep_drawn(lanes, pixels, number, k, fragments, stop):
-    """Keep the fragments of a Gaussian whose place is certain in those lanes of ``found`` that leave enough light.
+    """Append a Gaussian's fragments, of certain order, in those ``lanes`` that leave enough transmittance.
 
     Lane b is fragment ``number + b`` on the pixel ``pixels[b]``. Returns the other lanes.
     """
@@ -143,9 +143,9 @@ def _keep_drawn(lanes, pixels, number, k, fragments, stop):
 
 @njit(cache=True, error_model="numpy", forceinline=True)
 def _keep_alone(lanes, pixels, number, k, fragments, stop, live, dim, m):
-    """`_keep_drawn` for lanes that a stop may hide (B6).
+    """Do `_keep_drawn` for lanes that an early termination may hide (B6).
 
-    Returns ``live`` without the pixels that surely stop, and ``dim`` with those that get too little light.
+    Returns ``live`` without the pixels that surely terminate, and ``dim`` with those that get too little light.
     """
     per_pixel, values = fragments.per_pixel, fragments.values
     dark = max(stop.low, stop.floor)
@@ -177,7 +177,7 @@ def _keep_alone(lanes, pixels, number, k, fragments, stop, live, dim, m):
 
 @njit(cache=True, error_model="numpy", forceinline=True)
 def _keep_moving(lanes, pixels, number, k, slot, block, stop, dim, moved):
-    """Keep the fragments of slot ``slot``, whose place is uncertain; ``dim`` and the number of moves with theirs."""
+    """Append the fragments of ``slot``, whose order is open; return ``dim`` and the number of moves with theirs."""
     fragments, entries, reordering = block.fragments, block.entries, block.reordering
     per_pixel, values = fragments.per_pixel, fragments.values
     dark = max(stop.low, stop.floor)
@@ -208,7 +208,7 @@ def _keep_moving(lanes, pixels, number, k, slot, block, stop, dim, moved):
 
 @njit(cache=True, error_model="numpy", forceinline=True)
 def set_colors(palette, k, color, color_rows, channels):
-    """Write the colour of list position k: see `Palette`; ``color`` [channels, color_rows] is the Gaussian's."""
+    """Write the colour of list position k to the palette; ``color`` [channels, color_rows] is the Gaussian's."""
     forms, values = palette.forms, palette.values
     at = k * color_size(forms)
     for channel in range(channels):
@@ -226,7 +226,7 @@ def set_colors(palette, k, color, color_rows, channels):
 
 @njit(cache=True, error_model="numpy")
 def _colors_behind(first, listed, colors, channels, palette, marks):
-    """Ends of the colours of the list's entries from ``first`` on and of the background; marks them (design.md, B6)."""
+    """Write ends of the colours of the list's entries from ``first`` on and of the background; mark them (B6)."""
     color_columns = colors.shape[1]
     color_rows = color_columns // channels
     values, unseen = pointer(colors), palette.unseen
@@ -255,9 +255,9 @@ def _colors_behind(first, listed, colors, channels, palette, marks):
 
 @njit(cache=True, error_model="numpy", forceinline=True)
 def place_batch(start, some, live, listed, inputs, block):
-    """Find the pixels of `FragmentBatch` for ``some`` positions from ``start`` on that they may be drawn on.
+    """Find the pixels of `FragmentBatch` on which ``some`` positions from ``start`` on may be drawn.
 
-    Returns how many there are.
+    Returns the number of pixels.
     """
     gaussians, colors, batch = inputs.gaussians, inputs.colors.values, block.batch
     for b in range(some):
@@ -289,7 +289,7 @@ def place_batch(start, some, live, listed, inputs, block):
 
 @njit(cache=True, error_model="numpy", forceinline=True)
 def find_alphas(start, some, used, place, listed, inputs, block):
-    """Write the alphas of `place_batch`'s positions: fragments from number ``used`` on, and `FragmentBatch.found`."""
+    """Compute the alphas of `place_batch`'s positions: fragments from number ``used`` on, and `FragmentBatch.found`."""
     batch = block.batch
     for b in range(some):
         i = listed.numbers[start + b]
@@ -311,9 +311,9 @@ def find_alphas(start, some, used, place, listed, inputs, block):
 
 @njit(cache=True, error_model="numpy", forceinline=True)
 def _hide_dim(dim, k, length, live, missing, fragments, stop_low):
-    """Let pixels ``dim`` take no light behind position k unless something that is listed may still come behind it.
+    """Close the pixels ``dim`` behind position k, unless a listed fragment may still come behind it.
 
-    Returns ``live`` without these and the first position that is ``missing`` in any of them (B6).
+    Returns ``live`` without these pixels and the first position that is ``missing`` in any of them (B6).
     """
     per_pixel = fragments.per_pixel
     while dim != 0:
@@ -331,14 +331,14 @@ def _hide_dim(dim, k, length, live, missing, fragments, stop_low):
 def collect_fragments(numbers, place, inputs, block, marks_):
     """Collect the fragments of every pixel of a block, nearest first (design.md, B5-B6).
 
-    Fills ``block`` but for its sums, from the Gaussians ``numbers`` (rows of ``inputs.gaussians``), nearest first; sets
-    ``marks_`` [n] for those that some pixel that takes light may draw, or stop at. Returns the number of pairs and of
-    slots; or GIVE_UP where more pairs are uncertain than there is room for, or GROW where another buffer is too small.
+    Fills ``block``, without its sums, from the Gaussians ``numbers`` (rows of ``inputs.gaussians``), nearest first.
+    Sets ``marks_`` [n] for those that some open pixel may draw, or terminate at. Returns the number of pairs and of
+    slots; or GIVE_UP where more pairs are open than fit, or GROW where another buffer is too small.
 
-    A list may end where no pose leaves more light than ``inputs.cutoffs.floor``. All that is missing lies behind what
-    it holds, and row OPEN of `Fragments.per_pixel` bounds the light that comes there, `Palette.unseen` the colours.
-    OPEN is 0 where nothing is missing, as if the floor is negative. Row RHO receives how much transmittance may be lost
-    to a stop that the kept fragments ignore.
+    A list may end where no pose leaves more light than ``inputs.cutoffs.floor``. All missing fragments are behind those
+    in the list. Row OPEN of `Fragments.per_pixel` bounds the light that reaches them, `Palette.unseen` their colours;
+    OPEN is 0 where none is missing, as with a negative floor. Row RHO receives the transmittance that an early
+    termination, which the kept fragments ignore, may hide.
     """
     fragments, entries, reordering, batch = block.fragments, block.entries, block.reordering, block.batch
     charges, m = inputs.charges, inputs.shape.monomials
@@ -402,7 +402,7 @@ def collect_fragments(numbers, place, inputs, block, marks_):
 
 @njit(cache=True, error_model="numpy")
 def apply_stops(slots, block, inputs):
-    """Drop or weaken the fragments of uncertain depth order that the stop may hide (design.md, B6).
+    """Drop or weaken the fragments of open depth order that early termination may hide (design.md, B6).
 
     ``slots`` is their number.
     """
@@ -460,7 +460,7 @@ def apply_stops(slots, block, inputs):
 
 @njit(cache=True, error_model="numpy")
 def number_groups(length, entries):
-    """Number the groups of list positions into ``entries.far``: no uncertain pair spans two groups (design.md, O4)."""
+    """Write group numbers of list positions to ``entries.far``: no open pair spans two groups (design.md, O4)."""
     group = 0
     last = -1
     for k in range(length):

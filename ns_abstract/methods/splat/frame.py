@@ -1,4 +1,4 @@
-"""One frame of a splat scene, ready for refinement: bounds, renders and motion of its set of poses."""
+"""One frame of a splat scene, ready for refinement: bounds, renders and image motion of its pose set."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class FrameTuning:
-    """Preferences of splats' frames. None of them decides whether a bound holds."""
+    """Preferences of splats' frames; soundness does not depend on them."""
 
     #: Light that is not followed further: the part of the excess that may be allowed, and at most, and no less than
     #: so many times the rasteriser's stop.
@@ -62,7 +62,7 @@ class TileBounds(Bounds):
     """Bounds of some tiles.
 
     Attributes:
-        trivial: Blocks of pixels where too many depth orders were open: nothing is known.
+        trivial: Number of blocks of pixels with too many open depth orders, of which nothing is known.
         parts: [t, side, side, 6, k] see `PixelBounds.parts`; None: the cell has no sub-boxes.
     """
 
@@ -114,17 +114,17 @@ class SplatSample:
 
 
 class SplatFrame(Frame):
-    """Bounds and renders one frame's set of poses.
+    """Bounds and renders one frame's pose set.
 
     Args:
         splats: The activated scene.
-        rasteriser, arithmetic: What is bounded.
+        rasteriser, arithmetic: Of the bounded program.
         pose_set: The poses.
         order: Order of the forms: 1, or 2 for one parameter, which is the default for it.
         varied: The scenes of the set; None: ``splats`` alone.
-        sheared: Whether cells may be slanted, so that rotations make up for what other parameters move (P2). Their
+        sheared: Whether cells may be sheared, so that rotations compensate the motion by other parameters (P2). Their
             parameters are then not those of ``pose_set``.
-        layers: Whether accumulation and expected depth stand behind the colours, in renders and bounds.
+        layers: Whether accumulation and expected depth follow the colours, in renders and bounds.
         reference: Makes the renderer with gradients, for steps of `scene_samples`.
         sums: See `SubBoxBounds`.
     """
@@ -185,7 +185,7 @@ class SplatFrame(Frame):
 
     @property
     def _narrow(self) -> ParameterBox:
-        """A narrow cell at the set's lower ends."""
+        """Return a narrow cell at the set's lower ends."""
         box = self.box
         for axis in range(box.dimensions):
             box = box.split(axis, 1024)[0]
@@ -198,39 +198,39 @@ class SplatFrame(Frame):
             self.bounds.warm_up(self.camera, forms, shared_out(np.ones(self.box.dimensions), _TUNING.parts))
 
     def render(self, values: np.ndarray, tiles: np.ndarray | None = None) -> np.ndarray:
-        """Tiles [t, side, side, channels] float32 of the concrete image at parameter values [d]."""
+        """Return tiles [t, side, side, channels] float32 of the image at parameter values [d]."""
         check_cancelled()
         return self.drawn(values, tiles, None)
 
     def drawn(self, values: np.ndarray, tiles: np.ndarray | None, scene_sample: Splats | None) -> np.ndarray:
-        """What `render` returns, of another scene of the set if one is given."""
+        """Return the result of `render`, for another scene of the set if one is given."""
         return self.precise(values, tiles, scene_sample).astype(np.float32)
 
     def precise(
         self, values: np.ndarray, tiles: np.ndarray | None = None, scene_sample: Splats | None = None
     ) -> np.ndarray:
-        """What `drawn` rounds: float64."""
+        """Return the result of `drawn` before rounding: float64."""
         draw = self.renderer.tiles if self.channels == COLORS else self.renderer.layer_tiles
         return draw(self.camera, *self.pose_set.world_to_camera(values), tiles, scene_sample)
 
     def scene_samples(self, seed: int) -> Iterator[SplatSample]:
-        """Other scenes of the set, without end; none where nothing varies."""
+        """Yield other scenes of the set without end; none where nothing varies."""
         if self.varied.varies:
             for splats in self.varied.scene_samples(np.random.default_rng(seed)):
                 yield SplatSample(self, splats, self._reference)
 
     def set_tolerance(self, excess: float) -> float:
-        """Let later bounds be looser by a small part of ``excess`` on average, where that saves time (B6).
+        """Let later bounds be looser by a small fraction of ``excess`` on average, where that saves time (B6).
 
         Returns:
-            What no more light comes to is left out; 0: nothing is.
+            The light up to which fragments are left out; 0: none are.
         """
         floor = min(_TUNING.floor_share * excess, _TUNING.brightest_floor)
         self._floor = floor if floor > _TUNING.worth_it * self._stop > 0.0 else -1.0
         return max(self._floor, 0.0)
 
     def plan(self, visible: int | None, lower: np.ndarray, upper: np.ndarray) -> list[str]:
-        """What was left out for this frame, given what refinement found."""
+        """Return sentences on what was left out for this frame, given the bounds of refinement."""
         varied = self.varied
         total, plan = varied.nearest.count, []
         unknown = ~in_tiles((lower > 0.0) | (upper < 1.0), self.side).any(axis=(1, 2, 3))
@@ -317,7 +317,7 @@ class SplatFrame(Frame):
         return np.zeros((self.camera.height, self.camera.width), np.int64) if context is None else context.counts
 
     def _context(self, box: ParameterBox) -> EnclosingContext:
-        """The Gaussians that a cell may show."""
+        """Return the Gaussians that a cell may show."""
         projected = self.bounds.project(self.camera, self.pose_set.enclosure(box, self.order))
         marks = np.zeros(projected.candidates.size, np.uint8)
         marks[projected.alive] = 1
@@ -326,18 +326,18 @@ class SplatFrame(Frame):
         return EnclosingContext(visible, reach, rectangles_by_place(reach, self.camera.height, self.camera.width))
 
     def motion(self, box: ParameterBox) -> np.ndarray:
-        """[d] pixels that typical Gaussians move by over each parameter's range (an estimate)."""
+        """Return the estimated motion [d] in pixels of typical Gaussians over each parameter's range."""
         return self._image_motion.typical(box)
 
     def depths(self) -> np.ndarray:
-        """[n] depths of typical Gaussians that lie in the picture of the middle pose."""
+        """Return depths [n] of typical Gaussians in the picture of the middle pose."""
         return self._image_motion.depths()
 
     def _bound(
         self, box: ParameterBox, tiles: np.ndarray, within: VisibleContext | None, candidates: np.ndarray | None,
         keep_linear: bool, pixels: np.ndarray | None, sub_boxes: SubBoxes | None = None,
     ) -> TileBounds:  # fmt: skip
-        """`bound`, given what may be seen there; over ``sub_boxes`` of the box, too, if some are named."""
+        """Do `bound`, given the candidates; with ``sub_boxes`` also over these."""
         check_cancelled()
         forms = self.pose_set.enclosure(box, self.order)
         layers = self.channels > COLORS
@@ -364,19 +364,19 @@ class SplatFrame(Frame):
 
     @cached_property
     def _pace(self) -> np.ndarray:
-        """[d] pixels that typical Gaussians move by for each unit of a parameter; 0 where none moves."""
+        """Motion [d] in pixels of typical Gaussians for each unit of a parameter; 0 where none moves."""
         width = np.array(self.box.upper) - np.array(self.box.lower)
         moved = np.nan_to_num(np.array(self.motion(self.box), np.float64), nan=0.0, posinf=0.0)
         return moved / np.where(width > 0.0, width, np.inf)
 
     def _moved(self, box: ParameterBox) -> np.ndarray:
-        """[d] pixels that typical Gaussians move by over a cell along each axis."""
+        """Return the motion [d] in pixels of typical Gaussians over a cell along each axis."""
         return self._pace * (np.array(box.upper) - np.array(box.lower))
 
     def _parts(self, box: ParameterBox) -> np.ndarray | None:
-        """Numbers of parts [d] along the axes of a cell that is too wide for forms (B12); None: it is not.
+        """Return numbers of parts [d] along the axes of a cell that is too wide for forms (B12); None: it is not.
 
-        One parameter's forms fit much more, and colours that vary with a parameter ask for them.
+        Forms of one parameter follow much more motion, and colours that vary with a parameter need forms.
         """
         moved = self._moved(box)
         if box.dimensions < 2 or not np.all(self._pace > 0.0) or np.linalg.norm(moved) <= _TUNING.wide:
@@ -384,7 +384,7 @@ class SplatFrame(Frame):
         return shared_out(moved, _TUNING.parts)
 
     def _all_slopes(self, box: ParameterBox, slopes: np.ndarray, parts: np.ndarray) -> np.ndarray:
-        """``slopes`` [d] found over ``parts``, with those of axes that are not divided told by how far things move."""
+        """Return ``slopes`` [d] found over ``parts``, estimated from the motion for axes that are not divided."""
         moved = self._moved(box)
         rate = slopes[parts > 1].sum() / moved[parts > 1].sum()
         return np.where(parts > 1, slopes, rate * moved)
@@ -392,7 +392,7 @@ class SplatFrame(Frame):
     def candidates(
         self, tiles: np.ndarray, within: VisibleContext | None, pixels: np.ndarray | None
     ) -> np.ndarray | None:
-        """What may be seen on ``pixels`` of ``tiles`` in a cell ``within`` another; None: everything."""
+        """Return the Gaussians that may be visible on ``pixels`` in a cell ``within`` another; None: all."""
         if within is None:
             return None
         if tiles.size == self.tile_count and pixels is None:
@@ -404,7 +404,7 @@ class SplatFrame(Frame):
 
 
 def linear_sets(forms: np.ndarray, lower: np.ndarray, upper: np.ndarray, d: int) -> LinearSets:
-    """Linear lower and upper bounds of clamped pixels from their forms (design.md, B9).
+    """Return linear lower and upper bounds of clamped pixels from their forms (design.md, B9).
 
     Args:
         forms: [..., m + 1] polynomial coefficients and radius before the clamp to [0, 1].

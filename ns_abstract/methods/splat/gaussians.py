@@ -1,7 +1,7 @@
-"""Per-Gaussian stage of the bounds: from pose forms to what a pixel needs (design.md, G1-G11).
+"""The per-Gaussian stage of the bounds: projects Gaussians over a cell's poses (docs/dev/design.md, G1-G11).
 
-Gaussians that no pose of the cell shows are dropped, the others projected in blocks: by `line_projection` for one
-parameter and order 2, by `form_projection` otherwise. `projection_errors` tells what is left of each.
+Gaussians that no pose of the cell shows are dropped. The others are projected in blocks: by `line_projection` for one
+parameter and order 2, by `form_projection` otherwise. `projection_errors` describes the records.
 """
 
 from __future__ import annotations
@@ -42,10 +42,10 @@ from ns_abstract.methods.splat.work_sharing import CHUNK, run_in_chunks
 
 
 def covariance_noise(axes: np.ndarray, charges: Charges) -> np.ndarray:
-    """Float error of each world covariance and of the products made with it (design.md, G6).
+    """Return the float error of each world covariance and of the products made with it (design.md, G6).
 
-    ``axes``: [N, 3, 3] scaled principal axes. Returns [N, 12]: the error bounds and the absolute values of the entries
-    00, 11, 22, 01, 02, 12.
+    ``axes``: [N, 3, 3] scaled principal axes. The result [N, 12] holds error bounds, then absolute values, of the
+    entries 00, 11, 22, 01, 02, 12.
     """
     size = np.abs(axes)
     scale = np.sqrt(np.sum(axes * axes, axis=1))  # [N, 3]
@@ -69,7 +69,7 @@ class _ProjectionScratch(NamedTuple):
         work: Forms of eight, flat; see `form_projection`.
         rows: Rows of lanes, flat; see `projection_errors`.
         logarithms: [17, LANES] for `line_projection.compensate_line`.
-        places: [LANES] where records go.
+        places: [LANES] rows of the output for the records.
     """
 
     work: np.ndarray
@@ -80,7 +80,7 @@ class _ProjectionScratch(NamedTuple):
 
 @njit(cache=True, error_model="numpy")
 def _borrowed_inputs(scene, poses, camera, rules, charges, shape):
-    """The `ProjectionInputs` without references to the arrays' owners."""
+    """Return the `ProjectionInputs` without references to the arrays' owners."""
     scene = SceneGaussians(
         borrowed(scene.means), borrowed(scene.mean_radius), borrowed(scene.axes), borrowed(scene.extents),
         borrowed(scene.noise), borrowed(scene.opacity_low), borrowed(scene.opacity_high),
@@ -95,7 +95,7 @@ def _borrowed_inputs(scene, poses, camera, rules, charges, shape):
 
 @njit(cache=True, error_model="numpy", nogil=True)
 def _stage_worker(counter_, candidates_, scene, poses, camera, rules, charges, shape, out, state_):
-    """One thread's candidates: the next chunk that none has taken yet; see `gaussian_stage`."""
+    """Do the chunks of candidates that no other thread has taken; see `gaussian_stage`."""
     counter, candidates, state = pointer(counter_), borrowed(candidates_), borrowed(state_)
     inputs = _borrowed_inputs(scene, poses, camera, rules, charges, shape)
     out = ProjectedGaussians(
@@ -150,7 +150,7 @@ def gaussian_stage(
 
 @njit(cache=True, error_model="numpy")
 def _cull_block(candidates, block, inputs, scratch, state, alive, count):
-    """Drop the Gaussians of ``block`` that no pose of the cell shows (design.md, G3); others go to ``alive``."""
+    """Drop the Gaussians of ``block`` that no pose of the cell shows; append the others to ``alive`` (G3)."""
     scene, poses, rules, charges = inputs.scene, inputs.poses, inputs.rules, inputs.charges
     rotation, offset = pointer(poses.rotation), pointer(poses.offset)
     work, s_ = pointer(scratch.work), scratch.rows
@@ -214,7 +214,7 @@ def _cull_block(candidates, block, inputs, scratch, state, alive, count):
 
 @njit(cache=True, error_model="numpy", forceinline=True)
 def _linear_top(w, a, s, b, t, order, m):
-    """Upper bound of ``s a + t b`` over the box."""
+    """Return an upper bound of ``s a + t b`` over the box."""
     top = s * load8(w, a) + t * load8(w, b) + abs(s) * load8(w, a + 8 * m) + abs(t) * load8(w, b + 8 * m)
     for k in range(1, m):
         top = top + abs(s * load8(w, a + 8 * k) + t * load8(w, b + 8 * k))
@@ -223,7 +223,7 @@ def _linear_top(w, a, s, b, t, order, m):
 
 @njit(cache=True, error_model="numpy")
 def _project_block(candidates, block, inputs, scratch, out, state):
-    """Records of up to `LANES` Gaussians (design.md, G4-G11)."""
+    """Write records of up to `LANES` Gaussians (design.md, G4-G11)."""
     scene, poses, camera, rules, charges, shape = inputs
     s, logarithms = scratch.rows, scratch.logarithms
     # loops of a length that the compiler does not know become vector code
@@ -249,7 +249,7 @@ def _project_block(candidates, block, inputs, scratch, out, state):
 
 @njit(cache=True, error_model="numpy")
 def _scatter_records(block, s, places, record):
-    """Write the records in the rows ``s`` to those of ``record`` that ``block`` names."""
+    """Write the records in the rows ``s`` to the rows of ``record`` that ``block`` names."""
     last = block.shape[0] - 1
     for q in range(LANES):
         places[q] = block[min(q, last)]
@@ -271,7 +271,7 @@ def _scatter_records(block, s, places, record):
 
 @njit(cache=True, error_model="numpy")
 def _set_outputs(block, s, rotation_magnitude, charges, out, state):
-    """Write what `ProjectedGaussians` hold beside records, and the state (design.md, G10, S3)."""
+    """Write the fields of `ProjectedGaussians` other than records, and the state (design.md, G10, S3)."""
     depth, depth_error, delta, box, tiles = out.depth, out.depth_error, out.delta, out.box, out.tiles
     r0, r1, r2 = rotation_magnitude[6], rotation_magnitude[7], rotation_magnitude[8]
     for q in range(block.shape[0]):
@@ -299,7 +299,7 @@ def _set_outputs(block, s, rotation_magnitude, charges, out, state):
 
 @njit(cache=True, error_model="numpy")
 def _fill_records(s, cx, cy, count, m):
-    """What `regions` left open of the columns before a record's ``count`` forms; the mean's float error in these."""
+    """Fill the columns before a record's ``count`` forms that `regions` left; charge forms for the mean's error."""
     stride = m + 1
     for q in range(0, LANES, 8):
         store(s, row.R_MEAN_X + q, load8(s, row.X0 + q) + cx)

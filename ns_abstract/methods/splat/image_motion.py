@@ -1,4 +1,4 @@
-"""How far a set of poses moves a splat scene's picture: estimates, which decide how cells are cut."""
+"""Estimates of the image motion of a splat scene over a pose set, which decide how cells are cut."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from ns_abstract.perturbation.specification import ROTATIONS
 
 @dataclass(frozen=True)
 class MotionTuning:
-    """Preferences of the estimates. None of them decides whether a bound holds."""
+    """Preferences of the estimates; soundness does not depend on them."""
 
     #: Gaussians and poses looked at.
     gaussians: int = 2000
@@ -39,7 +39,7 @@ _TUNING = MotionTuning()
 
 
 class ImageMotion:
-    """How the picture of a set of poses moves, by typical Gaussians and by what its pixels show.
+    """The image motion of a pose set, by typical Gaussians and by the surface that its pixels show.
 
     Args:
         pose_set: The poses; boxes are of its parameters.
@@ -53,14 +53,14 @@ class ImageMotion:
 
     @cached_property
     def _means(self) -> np.ndarray:
-        """[n, 3] of typical Gaussians."""
+        """Means [n, 3] of typical Gaussians."""
         means = self._all_means
         if means.shape[0] > _TUNING.gaussians:
             means = means[np.random.default_rng(0).choice(means.shape[0], _TUNING.gaussians, replace=False)]
         return means
 
     def shear(self) -> dict[str, dict[str, float]]:
-        """For each rotation, how much of it undoes what one unit of another parameter moves typical Gaussians by."""
+        """Return for each rotation the amount that compensates the motion by one unit of another parameter."""
         box, middle = self.pose_set.box, self.pose_set.box.middle
         names = [name for name in ROTATIONS if name in box.names]
         others = [name for name in box.names if name not in ROTATIONS]
@@ -92,7 +92,7 @@ class ImageMotion:
         return shears
 
     def typical(self, box: ParameterBox) -> np.ndarray:
-        """[d] pixels that typical Gaussians move by over each parameter's range (an estimate)."""
+        """Return the estimated motion [d] in pixels of typical Gaussians over each parameter's range."""
         d, means = box.dimensions, self._means
         low, high = np.array(box.lower), np.array(box.upper)
         total = np.zeros(d)
@@ -109,13 +109,13 @@ class ImageMotion:
         return total
 
     def depths(self) -> np.ndarray:
-        """[n] depths of typical Gaussians that lie in the picture of the middle pose."""
+        """Return depths [n] of typical Gaussians in the picture of the middle pose."""
         means = self._means
         _, visible = self._seen(self.pose_set.box.middle, means)
         return self._project(self.pose_set.box.middle, means)[1][visible]
 
     def parallax(self, box: ParameterBox) -> np.ndarray:
-        """[d] pixels that typical Gaussians move by, over each range, beside what the pixels there do (an estimate)."""
+        """Return the estimated motion [d] of typical Gaussians relative to the pixels around them, over each range."""
         means, moved = self._means, self.of_squares(box)
         here, visible = self._seen(box.middle, means)
         columns, rows = here[visible].astype(np.int64).T
@@ -131,13 +131,13 @@ class ImageMotion:
 
     @property
     def side(self) -> int:
-        """Pixels across the squares of `of_squares`."""
+        """Side in pixels of the squares of `of_squares`."""
         return 1 if self._camera.width * self._camera.height <= _TUNING.most_squares else _TUNING.neighbourhood
 
     def of_squares(self, box: ParameterBox) -> np.ndarray:
-        """[squares, 2, d] pixels that a square's content moves by over half of a cell (B16), estimated in its middle.
+        """Return the estimated motion [squares, 2, d] in pixels of each square's content over half of a cell (B16).
 
-        Squares of `side` pixels stand row by row.
+        Squares of `side` pixels are in row order; the estimate is made at the cell's middle.
         """
         camera, side = self._camera, self.side
         here, z = self._project(box.middle, self._surface)
@@ -164,7 +164,7 @@ class ImageMotion:
 
     @cached_property
     def _surface(self) -> np.ndarray:
-        """[n, 3] points that the pixels show from the set's middle, at their expected depths."""
+        """Points [n, 3] that the pixels show from the set's middle, at their expected depths."""
         rotation, position = self.pose_set.world_to_camera(self.pose_set.box.middle)
         tiles = self._renderer.layer_tiles(self._camera, rotation, position)
         layers = assemble(tiles, self._camera)
@@ -174,20 +174,20 @@ class ImageMotion:
     def _points(
         self, rotation: np.ndarray, position: np.ndarray, x: np.ndarray, y: np.ndarray, z: np.ndarray
     ) -> np.ndarray:
-        """World points [n, 3] that a pose shows at places [n], [n] in the picture, pixels, at depths [n]."""
+        """Return the world points [n, 3] at pixel coordinates [n], [n] and depths [n] of a pose."""
         rays = np.stack(
             [(x - self._camera.cx) / self._camera.fx, (y - self._camera.cy) / self._camera.fy, 0.0 * x + 1.0]
         )
         return position + (rotation.T @ (rays * z)).T
 
     def _seen(self, values: np.ndarray, means: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Pixels [n, 2] of ``means`` and which of them [n] lie in the picture."""
+        """Return pixel coordinates [n, 2] of ``means``, and which of them [n] lie in the picture."""
         here, z = self._project(values, means)
         size = self._camera.width, self._camera.height
         return here, (z > 0.01) & (here > 0).all(axis=1) & (here < size).all(axis=1)
 
     def _project(self, values: np.ndarray, means: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Places [n, 2] of world points ``means`` [n, 3] in the picture, pixels, and their depths."""
+        """Return pixel coordinates [n, 2] of world points ``means`` [n, 3], and their depths."""
         # as the parameters go on: taken back into the set, a shift would come without the turn that undoes it
         rotation, position = self.pose_set.world_to_camera(values, beyond=True)
         x, y, z = rotation @ (means - position).T

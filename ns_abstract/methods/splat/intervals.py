@@ -1,6 +1,6 @@
-"""Blending of a pixel's fragments back to front as intervals, over a cell and over parts of it (design.md, B7, B12).
+"""Composites a pixel's fragments back to front as intervals, over a cell and over parts of it (design.md, B7, B12).
 
-SIMD lanes are the three channels, and a fourth one that is not used; or eight parts of the cell.
+SIMD lanes 0 to 2 hold the channels and lane 3 is padding; or lanes are eight parts of the cell.
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ AHEAD = 2
 
 
 class BlendBounds(NamedTuple):
-    """Bounds of a blend, and of the colours in it; lanes are channels."""
+    """Bounds of a composited pixel, and of the colours in it; lanes are channels."""
 
     low: Any
     high: Any
@@ -41,7 +41,7 @@ class BlendBounds(NamedTuple):
 
 
 class Thresholds(NamedTuple):
-    """Least alpha that may be drawn, and what larger ones are lowered to at least."""
+    """The least alpha that may be drawn, and the least value of the alpha cap."""
 
     drawn: float
     most: float
@@ -49,30 +49,30 @@ class Thresholds(NamedTuple):
 
 @njit(cache=True, error_model="numpy", forceinline=True)
 def thresholds_of(inputs):
-    """The `Thresholds` of a cell's rules in every evaluation (design.md, B4)."""
+    """Return the `Thresholds` of a cell's rules in every evaluation (design.md, B4)."""
     rules, room = inputs.rules, 1.0 - inputs.charges.threshold
     return Thresholds(rules.alpha_min * room, rules.alpha_max * room)
 
 
 @njit(cache=True, error_model="numpy", forceinline=True)
 def blend_least(behind, color, a_low, a_high):
-    """Least of a fragment of ``color`` over what is at least ``behind`` (design.md, B7)."""
+    """Return the least result of a fragment of ``color`` over something at least ``behind`` (design.md, B7)."""
     v = color - behind
     return fma(where(v < 0.0, a_high, a_low), v, behind)
 
 
 @njit(cache=True, error_model="numpy", forceinline=True)
 def blend_most(behind, color, a_low, a_high):
-    """Most of a fragment of ``color`` over what is at most ``behind`` (design.md, B7)."""
+    """Return the largest result of a fragment of ``color`` over something at most ``behind`` (design.md, B7)."""
     v = color - behind
     return fma(where(v > 0.0, a_high, a_low), v, behind)
 
 
 @njit(cache=True, error_model="numpy", forceinline=True)
 def _least_moved(behind, color, brightest, a_low, a_high, move):
-    """`blend_least` of a fragment that may be drawn behind some of those listed behind it (design.md, B12, O2, O3).
+    """Do `blend_least` for a fragment that may be drawn behind some of those listed behind it (design.md, B12, O2, O3).
 
-    ``brightest`` bounds their colours, ``move`` what the swap bound allows.
+    ``brightest`` bounds their colours, ``move`` is the change that the swap bound allows.
     """
     front = blend_least(behind, color, a_low, a_high)
     return maximum(front - move, minimum(front, fma(a_high, min(0.0, color - brightest), behind)))
@@ -80,14 +80,14 @@ def _least_moved(behind, color, brightest, a_low, a_high, move):
 
 @njit(cache=True, error_model="numpy", forceinline=True)
 def _most_moved(behind, color, darkest, a_low, a_high, move):
-    """`blend_most` of a fragment that may be drawn behind some of those listed behind it; see `_least_moved`."""
+    """Do `blend_most` for a fragment that may be drawn behind some of those listed behind it; see `_least_moved`."""
     front = blend_most(behind, color, a_low, a_high)
     return minimum(front + move, maximum(front, fma(a_high, max(0.0, color - darkest), behind)))
 
 
 @njit(cache=True, error_model="numpy", forceinline=True)
 def blend_interval(behind, values, at, colors, ends):
-    """One fragment over what is ``behind`` (design.md, B7); its colour's bounds stand at ``ends``."""
+    """Return one fragment over the interval ``behind`` (design.md, B7); its colour's bounds are at ``ends``."""
     a_low, a_high = values[at + ALPHA_LOW], values[at + ALPHA_HIGH]
     c_low, c_high = load4(colors, ends), load4(colors, ends + 4)
     return BlendBounds(
@@ -98,7 +98,7 @@ def blend_interval(behind, values, at, colors, ends):
 
 @njit(cache=True, error_model="numpy", forceinline=True)
 def part_alphas(values, at, part, inputs, thresholds):
-    """Least and most alpha of the fragment at ``at`` over eight parts of the cell from ``part`` on (design.md, B12)."""
+    """Return least and largest alpha of the fragment at ``at`` over eight parts of the cell from ``part`` on (B12)."""
     middles, count = inputs.parts.middles, inputs.shape.parts
     e = at + EXPONENT
     zero = 0.0 * load8(middles, part)
@@ -132,7 +132,7 @@ def _add_parts(out, slopes, channel, low, high, part, inputs):
 
 @njit(cache=True, error_model="numpy")
 def sort_keys(keys, order, count):
-    """Sort the first ``count`` of ``keys``, least first; ``order`` receives where each stood."""
+    """Sort the first ``count`` of ``keys``, least first; ``order`` receives their former positions."""
     for e in range(count):
         order[e] = e
     # by insertion, after sorting what lies far apart: most groups are small
@@ -152,13 +152,13 @@ def sort_keys(keys, order, count):
 
 @njit(cache=True, error_model="numpy")
 def _ordered_end(value, start, stop, channel, side, block, alphas):
-    """One end of a channel over eight parts of list entries [start, stop) in every order (design.md, B12, O4).
+    """Return one end of a channel over eight parts, for list entries [start, stop) in every order (design.md, B12, O4).
 
     Args:
-        value: The end of what lies behind them.
+        value: The end of the composite behind them.
         start, stop: The entries of a group.
         channel: 0 to 2.
-        side: 0: the least, 1: the most.
+        side: 0: the least, 1: the largest.
         block: The pixel's block.
         alphas: Bounds of alpha over the parts, two times eight for each entry.
     """
@@ -182,7 +182,7 @@ def _ordered_end(value, start, stop, channel, side, block, alphas):
 
 @njit(cache=True, error_model="numpy")
 def _blend_eight(begin, end, part, reordered, block, inputs, slopes):
-    """`blend_parts` of eight parts from ``part`` on; returns the darkest and the brightest colour."""
+    """Do `blend_parts` for eight parts from ``part`` on; return the darkest and the brightest colour."""
     fragments, palette, moves, out = block.fragments, block.palette, block.reordering.moves, block.part_ends
     values, colors, forms = fragments.values, palette.values, palette.forms
     alphas = offset_by(out, PART_ENDS + 6 * inputs.shape.parts)
@@ -249,10 +249,10 @@ def _blend_eight(begin, end, part, reordered, block, inputs, slopes):
 
 @njit(cache=True, error_model="numpy")
 def blend_parts(begin, end, reordered, block, inputs, slopes):
-    """Bounds of the list entries [begin, end) of a pixel by intervals over the parts of the cell (design.md, B12).
+    """Bound the list entries [begin, end) of a pixel by intervals over the parts of the cell (design.md, B12).
 
-    ``reordered`` tells whether fragments may change places. ``slopes`` [d, 4] receives how much the channels vary along
-    the parameters, as far as the parts tell.
+    ``reordered``: whether fragments may change their order. ``slopes`` [d, 4] receives the variation of the channels
+    along the parameters, estimated from the parts.
     """
     out, parts, d = block.part_ends, inputs.parts, inputs.shape.dimensions
     for k in range(4 * d):
@@ -284,7 +284,7 @@ def blend_parts(begin, end, reordered, block, inputs, slopes):
 def write_parts(fall, rise, part_ends, out, u):
     """Write the ends of `blend_parts` or `bound_sub_boxes`, widened by ``fall`` and ``rise``, to ``out`` [6, parts].
 
-    Ends that cross or are no numbers are written as they are: they bound nothing. ``u`` is scratch for 8 numbers.
+    Ends that cross or are NaN are written unchanged: they bound nothing. ``u`` is scratch for 8 numbers.
     """
     parts = out.shape[1]
     store(u, 0, -fall)

@@ -1,4 +1,4 @@
-"""Colours over cells of one parameter with forms of order 2: the vector loops of `colors.moving_colors` (C2)."""
+"""Colours over cells of one parameter, as forms of order 2: the vector loops of `colors.moving_colors` (C2)."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ _SLOT = 6 * LANES
 
 @njit(cache=True, error_model="numpy")
 def directions_line(s, n, degree, low):
-    """Unit directions and their products from the directions in slots 0 to 2; ``low``: bound of the squared lengths."""
+    """Compute unit directions and their products from slots 0 to 2; ``low``: lower bounds of the squared lengths."""
     for q in range(n):
         x, y, z = load(s, 0, LANES, q), load(s, _SLOT, LANES, q), load(s, 2 * _SLOT, LANES, q)
         length2 = combined(combined(multiplied(x, x), 1.0, multiplied(y, y), 1.0), 1.0, multiplied(z, z), 1.0)
@@ -75,7 +75,7 @@ def _shifted_square(s, n, left, factor, shift):
 
 @njit(cache=True, error_model="numpy")
 def basis_line(s, n, k):
-    """Basis function ``k`` >= 1 into its slot (`colors.sh_basis`)."""
+    """Compute basis function ``k`` >= 1 in its slot (`colors.sh_basis`)."""
     if k == 1:
         _multiple(s, n, _Y, -0.48860251190292)
     elif k == 2:

@@ -1,4 +1,4 @@
-"""Projection of Gaussians over cells of one parameter with forms of order 2 (design.md, G4-G9): one loop over lanes."""
+"""Projects Gaussians over cells of one parameter with forms of order 2 (design.md, G4-G9): one loop over lanes."""
 
 from __future__ import annotations
 
@@ -39,13 +39,13 @@ class _RotationRow(NamedTuple):
 
 @njit(cache=True, error_model="numpy", forceinline=True)
 def _column(forms, k):
-    """Column ``k`` of forms [6, n]."""
+    """Return column ``k`` of forms [6, n]."""
     return LineForm(forms[0, k], forms[1, k], forms[2, k], forms[3, k])
 
 
 @njit(cache=True, error_model="numpy", forceinline=True)
 def _rotation_row(rotation, k):
-    """Row ``k`` of the rotation [6, 9]."""
+    """Return row ``k`` of the rotation [6, 9]."""
     a, b, c = 3 * k, 3 * k + 1, 3 * k + 2
     return _RotationRow(
         _column(rotation, a), _column(rotation, b), _column(rotation, c),
@@ -57,7 +57,7 @@ def _rotation_row(rotation, k):
 
 @njit(cache=True, error_model="numpy", forceinline=True)
 def _rotated(r, x, y, z, shift, shift_size, spread):
-    """``r . (x, y, z) + shift`` for exact x, y, z and a form ``shift``, widened (`form_projection.rotate`)."""
+    """Return ``r . (x, y, z) + shift`` for exact x, y, z and a form ``shift``, widened (`form_projection.rotate`)."""
     a, b, c = abs(x), abs(y), abs(z)
     radius = r.x.radius * a + r.y.radius * b + r.z.radius * c + shift.radius
     radius += SUM_ROUNDING * (r.magnitude_x * a + r.magnitude_y * b + r.magnitude_z * c + shift_size)
@@ -76,7 +76,7 @@ def _negated(a):
 
 @njit(cache=True, error_model="numpy", forceinline=True)
 def _clamped(a, low, high, limit_low, limit_high):
-    """``min(limit_high, max(-limit_low, a))`` given bounds of ``a`` (`wide_forms.clamp`)."""
+    """Return ``min(limit_high, max(-limit_low, a))`` given bounds of ``a`` (`wide_forms.clamp`)."""
     a = raised(a, -limit_low, low, high)
     low, high = max(low, -limit_low), max(high, -limit_low)
     return _negated(raised(_negated(a), -limit_high, -high, -low))
@@ -84,7 +84,7 @@ def _clamped(a, low, high, limit_low, limit_high):
 
 @njit(cache=True, error_model="numpy", forceinline=True)
 def _pixels(a, z, ratio, focal):
-    """``focal a - (focal ratio) z``, which vanishes at the middle of the cell: a pixel offset times depth."""
+    """Return a pixel offset times depth, ``focal a - (focal ratio) z``, which vanishes at the middle of the cell."""
     # the pixel offset used later is exactly focal * ratio in float64
     shift = focal * ratio
     radius = focal * a.radius + abs(shift) * z.radius
@@ -97,7 +97,7 @@ def _pixels(a, z, ratio, focal):
 
 @njit(cache=True, error_model="numpy", forceinline=True)
 def _lowered(c, a, b):
-    """``c - a b``."""
+    """Return ``c - a b``."""
     return combined(c, 1.0, multiplied(a, b), -1.0)
 
 
@@ -108,14 +108,14 @@ def _sum_of_products(a0, b0, a1, b1, a2, b2):
 
 @njit(cache=True, error_model="numpy", forceinline=True)
 def _crossed(a, b, c, d):
-    """``(a d - b c)^2``."""
+    """Return ``(a d - b c)^2``."""
     cross = combined(multiplied(a, d), 1.0, multiplied(b, c), -1.0)
     return multiplied(cross, cross)
 
 
 @njit(cache=True, error_model="numpy", forceinline=True)
 def _seen_axis(rows, x, y, z, u, v):
-    """Of ``w = R b``, ``b = (x, y, z)`` a scaled axis: ``w0 - u w2``, ``w1 - v w2`` and the magnitude of ``w2``."""
+    """Return ``w0 - u w2``, ``w1 - v w2`` and the magnitude of ``w2``, for ``w = R b`` of a scaled axis b."""
     still = LineForm(0.0, 0.0, 0.0, 0.0)
     deep = _rotated(rows[2], x, y, z, still, 0.0, 0.0)
     n0 = _lowered(_rotated(rows[0], x, y, z, still, 0.0, 0.0), u, deep)
@@ -140,9 +140,7 @@ def _store_whitening(s, q, z, dx, dy, b, c, det):
 
 @njit(cache=True, error_model="numpy")
 def project_line(s, n, rotation, offset, camera, rules):
-    """Bounds and forms of ``n`` Gaussians from the rows that `projection_errors.gather` filled (design.md, G4-G9).
-
-    See design.md, G1.
+    """Compute bounds and forms of ``n`` Gaussians from the rows of `projection_errors.gather` (design.md, G1, G4-G9).
 
     ``rotation`` [6, 9] and ``offset`` [6, 3] are the pose's forms. Fills the rows ZLO .. HI, DEEP0 .. Y0, and the forms
     FP .. FW2, of K before the logarithm and of the determinant.
@@ -202,9 +200,9 @@ def project_line(s, n, rotation, offset, camera, rules):
 
 @njit(cache=True, error_model="numpy")
 def compensate_line(s, n, ratios, scratch, out):
-    """K = -log(compensation) into the rows FK, bounds of compensation^2 = |n0 x n1|^2 / det' into SQLO and SQHI.
+    """Compute K = -log(compensation) in rows FK, and bounds of compensation^2 = |n0 x n1|^2 / det' in SQLO and SQHI.
 
-    ``ratios``, ``out`` [6, lanes] and ``scratch`` [5, lanes] are scratch: the logarithm is no vector code.
+    ``ratios``, ``out`` [6, lanes] and ``scratch`` [5, lanes] are scratch: the logarithm is not vectorised.
     """
     for q in range(n):
         ratio = multiplied(load(s, row.FK, LANES, q), inverse(load(s, row.FD, LANES, q)))

@@ -1,4 +1,4 @@
-"""Tile and block lists of Gaussians, front to back: shared by the renderer and the bounds."""
+"""Lists of Gaussians by tile and by block, front to back, shared by the renderer and the bounds."""
 
 from __future__ import annotations
 
@@ -22,8 +22,8 @@ class TileLists(NamedTuple):
     """Gaussians of the tiles of an image, nearest first.
 
     Attributes:
-        wanted: [t] int64 numbers of the tiles to be drawn, row-major.
-        offsets: [T + 1] where the list of each of all T tiles begins in ``entries``; those not wanted are empty.
+        wanted: [t] int64 numbers of the requested tiles, row-major.
+        offsets: [T + 1] where the list of each of all T tiles begins in ``entries``; other tiles have empty lists.
         entries: uint32 rows of the Gaussians.
     """
 
@@ -33,7 +33,7 @@ class TileLists(NamedTuple):
 
 
 def depth_order(visible, depth):
-    """Indices ``visible`` sorted by ``depth[visible]``, equal depths by index."""
+    """Return the indices ``visible`` sorted by ``depth[visible]``, equal depths by index."""
     keys = depth[visible]
     order = np.argsort(keys)
     keys, order = keys[order], visible[order]
@@ -45,16 +45,16 @@ def depth_order(visible, depth):
 
 
 def tile_mask(wanted, count):
-    """[count] 1 for the tiles ``wanted`` (numbers), 0 for the others."""
+    """Return [count] 1 for the tiles ``wanted`` (numbers), 0 for the others."""
     mask = np.zeros(count, np.uint8)
     mask[wanted] = 1
     return mask
 
 
 def pixel_sets(chosen, count, side):
-    """[t, blocks] int64 sets of each block's pixels that are ``chosen`` [t, side, side], blocks row by row.
+    """Return [t, blocks] int64 bit sets of each block's ``chosen`` pixels [t, side, side], blocks row by row.
 
-    None: all of ``count`` tiles of ``side`` pixels.
+    None: all pixels of ``count`` tiles of ``side`` pixels.
     """
     along = side // BLOCK
     if chosen is None:
@@ -64,7 +64,7 @@ def pixel_sets(chosen, count, side):
 
 
 def summed_area(chosen):
-    """[rows + 1, columns + 1] int32 how many of the places ``chosen`` [rows, columns] lie above and left of each."""
+    """Return [rows + 1, columns + 1] int32 the number of ``chosen`` places [rows, columns] above and left of each."""
     table = np.zeros((chosen.shape[0] + 1, chosen.shape[1] + 1), np.int32)
     table[1:, 1:] = np.cumsum(np.cumsum(chosen, axis=0, dtype=np.int32), axis=1, dtype=np.int32)
     return table
@@ -72,10 +72,10 @@ def summed_area(chosen):
 
 @njit(cache=True, error_model="numpy")
 def touching(indices, rectangles, table):
-    """Those of ``indices`` (rows of ``rectangles``) whose rectangle holds a place that was chosen.
+    """Return those of ``indices`` (rows of ``rectangles``) whose rectangle contains a chosen place.
 
     ``rectangles`` [n, >= 4] are columns first and past, rows first and past, of tiles or pixels; ``table`` is the
-    `summed_area` of what was chosen of these.
+    `summed_area` of the chosen places.
     """
     out = np.empty_like(indices)
     count = 0
@@ -88,7 +88,7 @@ def touching(indices, rectangles, table):
 
 
 def rectangles_by_place(rectangles, rows, columns):
-    """[rows, columns] int64 how many of the ``rectangles`` [n, 4] (see `touching`) each place lies in."""
+    """Return [rows, columns] int64 the number of ``rectangles`` [n, 4] (see `touching`) that contain each place."""
     # those of Gaussians end with their tiles, which reach beyond a picture whose sides they do not divide
     x0, x1, y0, y1 = np.minimum(np.maximum(rectangles, 0), [columns, columns, rows, rows]).T
     some = (x0 < x1) & (y0 < y1)
@@ -106,9 +106,9 @@ def rectangles_by_place(rectangles, rows, columns):
 def visible_again(marks, numbers, box, tiles, side):
     """Return the ``numbers`` whose mark is not 0, and the pixel rectangles on which they may be drawn (design.md, R2).
 
-    ``box`` [n, 4] is the least and largest x, least and largest y that they reach, pixels; NaN: not known. ``tiles``
-    [n, >= 4] are their ranges of tiles of a ``side``, see `tile_lists`; what they reach elsewhere is not drawn. Returns
-    [k], and [k, 4] int32 columns first and past, rows first and past.
+    ``box`` [n, 4] is the least and largest x, least and largest y that they reach, pixels; NaN: unknown. ``tiles`` [n,
+    >= 4] are their ranges of tiles of ``side`` pixels, see `tile_lists`; they are not drawn elsewhere. Returns [k], and
+    [k, 4] int32 columns first and past, rows first and past.
     """
     count = 0
     for k in range(marks.size):
@@ -133,13 +133,13 @@ def visible_again(marks, numbers, box, tiles, side):
 
 
 def longest_first(wanted, offsets):
-    """Positions in ``wanted`` (tile numbers), those with the longest lists first: threads end together."""
+    """Return positions in ``wanted`` (tile numbers), longest lists first, so that threads end together."""
     return np.argsort(offsets[wanted] - offsets[wanted + 1], kind="stable")
 
 
 @njit(cache=True, error_model="numpy")
 def tile_lists(order, tiles, wanted, tiles_x):
-    """Offsets [T + 1] and entries of the lists of the T tiles whose ``wanted`` is not 0.
+    """Return offsets [T + 1] and entries of the lists of the T tiles whose ``wanted`` is not 0.
 
     ``tiles`` [n, >= 4] holds tile ranges x0, x1, y0, y1 (x1, y1 exclusive) by Gaussian.
     """
@@ -177,7 +177,7 @@ def block_lists(entries, box, x0, y0, tile, offsets, out):
         x0, y0: The tile's first pixel.
         tile: The tile's side in pixels, a multiple of `BLOCK`.
         offsets: Output [B^2 + 1] with B = tile / BLOCK.
-        out: Scratch for the entries; returned, enlarged where it was too small.
+        out: Memory for the entries; returned, enlarged where it was too small.
     """
     side = tile // BLOCK
     offsets[:] = 0
@@ -208,7 +208,7 @@ def block_lists(entries, box, x0, y0, tile, offsets, out):
 
 @njit(cache=True, inline="always")
 def _block_range(low, high, origin, side):
-    """Blocks [first, past) with a pixel centre in [low, high]; clipped to the tile."""
+    """Return the blocks [first, past) with a pixel centre in [low, high], clipped to the tile."""
     span = float(side * BLOCK)
     a = min(max(low - 0.5 - origin, -1.0), span)
     b = min(max(high - 0.5 - origin, -1.0), span)

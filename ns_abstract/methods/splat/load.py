@@ -1,7 +1,7 @@
-"""Load a Gaussian-splat scene from an ``ns-train`` run folder or a standard 3DGS ``.ply``.
+"""Loads a Gaussian-splat scene from an ``ns-train`` run folder or a standard 3DGS ``.ply``.
 
-Refuses a run whose class, or whose checkpoint's modules, are not known to draw what Splatfacto draws.
-Nothing from Nerfstudio is imported and no code in the files is run.
+It refuses a run whose class, or whose checkpoint's modules, are not known to draw what Splatfacto draws. It imports
+nothing from Nerfstudio and runs no code in the files.
 """
 
 from __future__ import annotations
@@ -63,16 +63,16 @@ _FIELDS = {"scales": "vertex.scale_*", "quats": "vertex.rot_*", "opacities": "ve
 
 
 def load_scene(path: str | os.PathLike[str], overrides: Overrides | None = None) -> SplatScene:
-    """Read a scene.
+    """Return the scene of a run or file.
 
     Args:
         path: ``config.yml`` of a run, the run folder that holds it, or a file or folder of another program
             (docs/formats.md).
-        overrides: What the user says in place of the files.
+        overrides: The user's values in place of the files'.
 
     Returns:
         The stored parameters; world is the run's normalised frame, or that of the ``.ply``. ``sh`` keeps the bands up
-        to the degree that Nerfstudio evaluates after loading.
+            to the degree that Nerfstudio evaluates after loading.
 
     Raises:
         InputError: For any content of the files, or an override, that cannot be used.
@@ -112,10 +112,10 @@ def scene_from_parameters(
     rasterize_mode: Literal["classic", "antialiased"],
     background: Float32Array,
 ) -> SplatScene:
-    """The scene that a loaded Splatfacto model holds, checked as one that is read from files.
+    """Return the scene of a loaded Splatfacto model, checked like one that is read from files.
 
-    ``parameters``: means [N, 3], scales [N, 3], quats [N, 4], features_dc [N, 3], features_rest [N, K - 1, 3] and
-    opacities [N, 1], arrays. ``name``, ``color_model``, ``sh_degree``, ``rasterize_mode``, ``background``: as in
+    ``parameters``: arrays means [N, 3], scales [N, 3], quats [N, 4], features_dc [N, 3], features_rest [N, K - 1, 3]
+    and opacities [N, 1]. ``name``, ``color_model``, ``sh_degree``, ``rasterize_mode``, ``background``: as in
     `SplatScene`. Raises InputError where a value is not finite or cannot be drawn.
     """
     stored_arrays = {key: np.array(parameters[key], np.float32) for key in _PARAMETERS}
@@ -142,7 +142,7 @@ def scene_from_parameters(
 
 
 def load_run(run: runs.RunConfig, overrides: Overrides) -> SplatScene:
-    """The scene of a run whose configuration has been read, as `load_scene` returns it."""
+    """Return the scene of a run whose configuration has been read, as `load_scene` does."""
     degree_stored = run.integer("sh_degree", _MODEL_DEFAULTS["sh_degree"], 0, _MAX_DEGREE_STORED)
     interval = run.integer("sh_degree_interval", _MODEL_DEFAULTS["sh_degree_interval"], 1)
     choices, background = _picture(run, overrides)
@@ -186,7 +186,7 @@ def load_run(run: runs.RunConfig, overrides: Overrides) -> SplatScene:
 
 
 def _picture(run: runs.RunConfig, overrides: Overrides) -> tuple[tuple[Assumption, ...], Float32Array]:
-    """How to rasterise and the background: records of the choices, and the colour."""
+    """Return records of the choices of rasterisation and background, and the background's colour."""
     origins = {
         name: f"config.yml: pipeline.model.{name}" if name in run.model else "default of nerfstudio 1.1.5"
         for name in ("rasterize_mode", "background_color")
@@ -207,10 +207,10 @@ def _picture(run: runs.RunConfig, overrides: Overrides) -> tuple[tuple[Assumptio
 def _check_model(
     run: runs.RunConfig, state: dict[str, Any], checkpoint: Path, assumed: bool
 ) -> tuple[bool, tuple[Assumption, ...]]:
-    """Whether the bounds are of the Gaussians alone, and records of the model's class and idle modules.
+    """Return whether bounds are of the Gaussians alone, and records of the model's class and ignored modules.
 
     Raises:
-        InputError: The class or a module is not known, and nobody says that it is Splatfacto's.
+        InputError: The class or a module is unknown, and the user does not say that it is Splatfacto's.
     """
     name = runs.target_class(run)
     unknown = sorted({_module(key) for key in state if not _known(key)})
@@ -242,7 +242,7 @@ def _known(key: str) -> bool:
 
 
 def _module(key: str) -> str:
-    """The outermost module of a tensor, or the tensor's own name in ``gauss_params``."""
+    """Return the outermost module of a tensor, or the tensor's own name in ``gauss_params``."""
     return key if key.startswith("gauss_params.") else key.partition(".")[0]
 
 
@@ -256,7 +256,7 @@ def _run_field(name: str) -> str:
 
 
 def _gaussian_state(state: dict[str, Any], file: Path, method: str) -> dict[str, Any]:
-    """The six parameter tensors by short name."""
+    """Return the six parameter tensors by short name."""
     # Old keys win over new ones, as in SplatfactoModel.load_state_dict.
     prefix = "" if "means" in state else "gauss_params."
     if f"{prefix}means" not in state:
@@ -322,10 +322,10 @@ def _row_count(means: Any, file: Path) -> int:
 
 
 def load_ply(path: Path, overrides: Overrides) -> SplatScene:
-    """The scene of a standard or compressed ``.ply``.
+    """Return the scene of a standard or compressed ``.ply``.
 
-    A ``cfg_args`` in the folder that the file was trained in says the background. Raises InputError: for any content of
-    the file, or an override, that cannot be used.
+    The background is that of a ``cfg_args`` in the folder that the file was trained in. Raises InputError: for any
+    content of the file, or an override, that cannot be used.
     """
     overrides.refuse(("load_step", "assume_splatfacto"), "is for runs, this file is a .ply")
     declared = read_declaration(path, overrides.rasterize_mode is not None)
@@ -373,11 +373,11 @@ def _decode(path: Path, header: PlyHeader) -> DecodedSplats:
 def filtered(
     log_scales: Float32Array, opacity_logits: Float32Array, width: Float32Array
 ) -> tuple[Float32Array, Float32Array]:
-    """Scales and opacities with mip-splatting's 3-D filter, as its ``save_fused_ply`` stores them.
+    """Return scales and opacities with mip-splatting's 3-D filter, as its ``save_fused_ply`` stores them.
 
     With s the scales and f the filter's ``width`` [N], the scales become sqrt(s^2 + f^2) and the opacity is multiplied
     by sqrt(prod(s^2) / prod(s^2 + f^2)). Takes logarithms [N, 3] and logits [N]; computed in float64 and rounded once
-    to float32; rows of width 0 stay as they are.
+    to float32; rows of width 0 are unchanged.
     """
     with np.errstate(all="ignore"):
         square = np.square(np.exp(log_scales.astype(np.float64)))
@@ -395,7 +395,7 @@ def filtered(
 
 
 def _columns(vertex: Any, names: tuple[str, ...]) -> Float32Array:
-    """Columns of the vertex table as [N, len(names)] float32."""
+    """Return columns of the vertex table as [N, len(names)] float32."""
     array = np.empty((len(vertex), len(names)), np.float32)
     for i, name in enumerate(names):
         with np.errstate(over="ignore", under="ignore", invalid="ignore"):

@@ -1,4 +1,4 @@
-"""Splatfacto runs as the command lines see them; see `ns_abstract.refine.protocol.Method`."""
+"""Splatfacto scenes as a method for commands and the Python API; see `ns_abstract.refine.protocol.Method`."""
 
 from __future__ import annotations
 
@@ -50,7 +50,7 @@ _WITH_TILES = "the alpha threshold and tiles"
 
 
 class SplatMethod(Method):
-    """A splat scene and the program that is bounded.
+    """A splat scene and the bounded renderer.
 
     Args:
         renderer: "gsplat" or "paper"; None: gsplat.
@@ -92,7 +92,7 @@ class SplatMethod(Method):
         return f"{self.scene.count:,} Gaussians{alone}"
 
     def frame(self, poses: PoseBox, sheared: bool = False, layers: bool = False) -> SplatFrame:
-        """One frame, ready for refinement; ``sheared``, ``layers``: see `SplatFrame`; the paper's has no layers."""
+        """Return one frame; ``sheared``, ``layers``: see `SplatFrame`; the paper's renderer has no layers."""
         if layers and self.rasteriser.name != "gsplat":
             raise InputError("the paper's renderer has no depth", field="--outputs", fix="leave it out")
         varied = self.varied(poses.perturbation.scene)
@@ -103,7 +103,7 @@ class SplatMethod(Method):
         )  # fmt: skip
 
     def weight_frame(self, poses: PoseBox, planes: Sequence[WeightPlane], pixels: np.ndarray) -> SplatWeightFrame:
-        """See `ns_abstract.refine.protocol.WeightMethod`; tiles of which no pixel is read cost nothing anyway.
+        """See `ns_abstract.refine.protocol.WeightMethod`; tiles without a pixel to read cost nothing anyway.
 
         Raises:
             InputError: A selection picks no Gaussian.
@@ -135,7 +135,7 @@ class SplatMethod(Method):
             self.varied(perturbation.scene)
 
     def varied(self, variations: tuple[SceneVariation, ...]) -> VariedSplats:
-        """The scenes of a set."""
+        """Return the scenes of a set."""
         if variations not in self._varied:
             while len(self._varied) >= _KEPT:
                 oldest = next(iter(self._varied))
@@ -200,13 +200,13 @@ class SplatMethod(Method):
         }
 
     def elements(self) -> SceneElements:
-        """The Gaussians, in the colours of band 0."""
+        """Return the Gaussians in the colours of band 0."""
         splats, base = self.splats, self.splats.sh[:, 0]
         colors = base if splats.degree == 0 else SH_C0 * base + 0.5
         return SceneElements(splats.means, splats.axes, np.clip(colors, 0.0, 1.0), splats.opacity)
 
     def differentiable(self, poses: PoseBox) -> Callable[[torch.Tensor], torch.Tensor]:
-        """Parameter values [d] to the picture [H, W, 3], by the reference renderer."""
+        """Return the reference renderer, from parameter values [d] to the picture [H, W, 3]."""
         from ns_abstract.geometry.differentiable_pose import differentiable_pose
 
         reference, pose = self._slow(), differentiable_pose(poses)
@@ -244,7 +244,7 @@ SPLAT = Representation(lambda source: True, _load, _method)
 
 @dataclass(frozen=True)
 class CauseTuning:
-    """What stands for the absence of a rule, and how many Gaussians are looked at; no bound of a picture uses them."""
+    """How ablations replace a rule, and how many Gaussians attribution examines; no picture's bound uses them."""
 
     #: The threshold that stands for none: a jump by this part of it is not seen.
     threshold_part: float = 2.0**-5
@@ -271,7 +271,7 @@ class _OrderedBounds(SubBoxBounds):
 def ablations(
     scene: SplatScene, rasteriser: Rasteriser, arithmetic: Arithmetic, poses: PoseBox, varied: VariedSplats
 ) -> Iterator[tuple[str, SplatFrame]]:
-    """Return the causes of looseness that the scene has, each with the frame without it."""
+    """Yield the causes of looseness that the scene has, each with the frame without it."""
 
     def frame(rules: Rasteriser = rasteriser, computed: Arithmetic = arithmetic, fixed: bool = False) -> SplatFrame:
         splats = activate(scene, rules)
@@ -303,8 +303,8 @@ def ablations(
 def attribution(frame: SplatFrame, box: ParameterBox, tile: int, count: int) -> list[tuple[int, float]]:
     """Return the Gaussians that cost a tile the most mean gap over a cell, and how much each costs.
 
-    Groups are left out in turn, and those that matter are looked at closer, so Gaussians that matter only together
-    may be missed.
+    Groups are left out in turn, and those that matter are subdivided, so Gaussians that matter only together may be
+    missed.
     """
     forms, tiles = frame.pose_set.enclosure(box, frame.order), np.array([tile])
 

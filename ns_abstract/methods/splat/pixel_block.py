@@ -1,10 +1,9 @@
-"""The memory layout of a block of pixels in the pixel stage (design.md, B1-B12).
+"""The memory layout of a block of pixels in the pixel stage (docs/dev/design.md, B1-B12).
 
-A fragment is one Gaussian on one pixel: what is known of its alpha, and of the light before and behind it. Fragments
-lie one after the other; each pixel lists those that may contribute to it, nearest first, with the places of their
-colours in a palette and of the rows that tell how far reordering may move them.
-
-`Buffers` own the memory; a `PixelBlock` is what kernels are given, with pointers to it in place of arrays.
+A fragment is one Gaussian on one pixel, with its alpha and the light before and behind it. Fragments are stored one
+after the other. Each pixel lists those that may contribute to it, nearest first, with the places of their colours in a
+palette, and of the rows that bound the effect of reordering. `Buffers` own the memory; kernels are given a
+`PixelBlock`, with pointers in place of arrays.
 """
 
 from __future__ import annotations
@@ -55,7 +54,7 @@ CROSSING_FORM, CROSSING_RESTRICTED = 11, 13
 
 
 class BlockPlace(NamedTuple):
-    """A block's first pixel in the picture, its tile's column and row, and the set of its pixels that are wanted."""
+    """A block's first pixel in the picture, its tile's column and row, and the set of its requested pixels."""
 
     x0: int
     y0: int
@@ -66,7 +65,7 @@ class BlockPlace(NamedTuple):
 
 @njit(cache=True, error_model="numpy", forceinline=True)
 def block_place(tile_x, tile_y, b, side, wanted):
-    """The `BlockPlace` of block ``b``, row by row, of a tile of ``side`` pixels."""
+    """Return the `BlockPlace` of block ``b``, row by row, of a tile of ``side`` pixels."""
     blocks = side // BLOCK
     x0, y0 = tile_x * side + (b % blocks) * BLOCK, tile_y * side + (b // blocks) * BLOCK
     return BlockPlace(x0, y0, tile_x, tile_y, wanted)
@@ -76,17 +75,16 @@ class Fragments(NamedTuple):
     """The fragments of a block's pixels.
 
     Attributes:
-        values: [PIXELS capacity, width] fragments; the columns are ALPHA_LOW .. FORM + m, and
-            ``bends`` more.
+        values: [PIXELS capacity, width] fragments; the columns are ALPHA_LOW .. FORM + m, and ``bends`` more.
         width: Numbers of a fragment.
-        bends: Coefficients of products of two parameters that are kept beside forms of order 1.
+        bends: Number of coefficients of products of two parameters beside forms of order 1.
         crossing: See `crossing_column`.
-        parts: Parts of the cell that pixels are bounded over; 0: fragments have forms.
+        parts: Parts of the cell over which pixels are bounded; 0: fragments have forms.
         lists: [PIXELS, capacity, LISTED] each pixel's fragments, nearest first.
-        light: [PIXELS, capacity, 2] the light at each: see `LEFT`.
+        light: [PIXELS, capacity, 2] the transmittance at each: see `LEFT`.
         lengths: [PIXELS] of the lists.
-        capacity: Fragments that each list has room for.
-        per_pixel: [ROWS, PIXELS] what is known of each pixel.
+        capacity: Largest length of a list.
+        per_pixel: [ROWS, PIXELS] further numbers of each pixel.
     """
 
     values: np.ndarray
@@ -102,13 +100,13 @@ class Fragments(NamedTuple):
 
 
 class Palette(NamedTuple):
-    """Colours of a block's list; each is rows of three channels and one of the depth, if that is asked for.
+    """Colours of a block's list; each has rows of three channels and one of the depth, if that is requested.
 
     Attributes:
         values: [entries, forms + 3, 4] coefficients, radius, lower and upper bound over the cell.
         forms: Coefficients of a colour.
         background: [4].
-        unseen: [2, 4] darkest and brightest of what fragments that were left out show.
+        unseen: [2, 4] darkest and brightest colour of omitted fragments.
     """
 
     values: np.ndarray
@@ -123,10 +121,10 @@ class ListEntries(NamedTuple):
     Attributes:
         pixels: The set of the block's pixels that may be reached; valid where ``has_pixels`` is 1.
         has_pixels: Whether ``pixels`` was found.
-        depth_radius: How far in depth the Gaussian may move against the block's central ray (O1).
+        depth_radius: Largest motion in depth of the Gaussian relative to the block's central ray (O1).
         depth: At the cell's middle.
-        far: Positions that reach further than most, in order; later the group that a position belongs to (O4).
-        first, last: Nearest and farthest position whose depth order against this one is uncertain, or itself.
+        far: Positions that move further than most, in order; later the group of a position (O4).
+        first, last: Nearest and farthest position whose depth order against this one is open, or itself.
     """
 
     pixels: np.ndarray
@@ -139,16 +137,16 @@ class ListEntries(NamedTuple):
 
 
 class Reordering(NamedTuple):
-    """Which fragments of a block may change places. A list position that takes part in that has a slot.
+    """The fragments of a block that may change their order. A list position with such fragments has a slot.
 
     Attributes:
-        pairs: [pair_limit, 2] list positions of uncertain order, the nearer at the middle first.
-        pair_limit: Room for pairs.
+        pairs: [pair_limit, 2] list positions of open order, the nearer at the middle first.
+        pair_limit: Largest number of pairs.
         slots: [entries] number of a position's slot; -1: its order is certain.
         owners: [slots] list positions.
-        drawn: [2 capacity] the set of pixels that a slot is drawn on.
+        drawn: [2 capacity] the set of pixels on which a slot is drawn.
         places: [2 capacity, PIXELS] a slot's place in their lists.
-        moves: [32 capacity, MOVES] see `MOVES`; row 0 is for fragments that do not move.
+        moves: [32 capacity, MOVES] see `MOVES`; row 0 is for fragments of certain order.
     """
 
     pairs: np.ndarray
@@ -164,10 +162,10 @@ class ThresholdCrossings(NamedTuple):
     """Fragments of one pixel whose alpha crosses the threshold within the cell (B11), farthest first.
 
     Attributes:
-        entries: [capacity] where they stand in the pixel's list.
-        distances: [capacity, 8] by channel, the least and then the greatest of its colour minus what is behind.
+        entries: [capacity] their places in the pixel's list.
+        distances: [capacity, 8] by channel, the least, then the greatest of its colour minus the colour behind it.
         rows: [R, room] numbers of each, in the R rows that `threshold_crossings` lists.
-        room: Whole lanes.
+        room: Length of rows, whole lanes.
     """
 
     entries: np.ndarray
@@ -177,12 +175,12 @@ class ThresholdCrossings(NamedTuple):
 
 
 class FragmentBatch(NamedTuple):
-    """Scratch for `BATCH` list positions on the pixels that they may reach, one after the other.
+    """Scratch for `BATCH` list positions on the pixels that they may reach, one position after the other.
 
     Attributes:
         offset_x, offset_y: [BATCH PIXELS] pixel centre minus mean, pixels.
         pixels: [BATCH PIXELS] numbers of the pixels.
-        begins: [BATCH + 1] where the pixels of each begin.
+        begins: [BATCH + 1] where the pixels of each position begin.
         found: [BATCH] the set of those of its pixels on which alpha may reach the threshold.
         rows: [width + 2 m, 8] columns of eight fragments, then scratch.
     """
@@ -199,10 +197,11 @@ class PixelBlock(NamedTuple):
     """A block as kernels take it: pointers to `Buffers`.
 
     Attributes:
-        shifted: Depths of one pixel's list against its own reference (see `depths`).
-        part_ends: Over parts of the cell: least of the channels and most, [2, 4], scratch, and from `PART_ENDS` on the
-            least of three channels and the most in each part or sub-box, [6, parts]; then scratch for a list's alphas.
-        sums: [3 m + bends + 5, 4] scratch by channel: polynomials, then what `blend` and `depths` need beside them.
+        shifted: Depths of one pixel's list relative to its own reference (see `depths`).
+        part_ends: Over parts of the cell: least and largest of the channels [2, 4], scratch, and from `PART_ENDS` on
+            the least of three channels and the largest in each part or sub-box [6, parts]; then scratch for a list's
+            alphas.
+        sums: [3 m + bends + 5, 4] scratch by channel: polynomials, then scratch of `blend` and `depths`.
         ray: [3] the block's central ray at the cell's middle, world axes, of unit depth.
         motion: [4, d, PIXELS] the pixels' `MotionCells.motion`, where parts are those of the image motion.
     """
@@ -222,7 +221,7 @@ class PixelBlock(NamedTuple):
 
 @njit(cache=True, error_model="numpy", inline="always")
 def part_axes(shape):
-    """Number of axes that the parts of a cell divide."""
+    """Return the number of axes that the parts of a cell divide."""
     return 2 if shape.by_motion else shape.dimensions
 
 
@@ -243,13 +242,13 @@ def take_motion(place, inputs, block):
 
 @njit(cache=True, error_model="numpy")
 def bends_of(shape):
-    """Coefficients of products of two parameters that pixels keep beside the Gaussians' forms (design.md, B10)."""
+    """Return the number of coefficients of products of two parameters beside the Gaussians' forms (design.md, B10)."""
     return 0 if shape.order == 2 else shape.dimensions * (shape.dimensions + 1) // 2
 
 
 @njit(cache=True, error_model="numpy")
 def fragment_width(shape):
-    """Numbers of a fragment of forms of ``shape``: whole cache lines."""
+    """Return the numbers of a fragment with forms of ``shape``: whole cache lines."""
     if shape.parts > 0:
         return -(-(exponent_limit(shape) + 1) // 8) * 8
     return -(-max(FORM + shape.monomials + 1 + bends_of(shape), crossing_column(shape) + 1) // 8) * 8
@@ -257,32 +256,32 @@ def fragment_width(shape):
 
 @njit(cache=True, error_model="numpy", inline="always")
 def exponent_ends(m):
-    """Where in a fragment the radii stand that follow the exponent's slopes, see `EXPONENT`."""
+    """Return the column in a fragment of the radii behind the exponent's slopes, see `EXPONENT`."""
     return EXPONENT + 2 * m
 
 
 @njit(cache=True, error_model="numpy", inline="always")
 def exponent_limit(shape):
-    """Where in a fragment the exponent stands beyond which alpha is below the threshold (B4), see `EXPONENT`."""
+    """Return the column in a fragment of the exponent above which alpha is below the threshold (B4), see `EXPONENT`."""
     return exponent_ends(shape.monomials) + 5
 
 
 @njit(cache=True, error_model="numpy")
 def crossing_column(shape):
-    """Where a fragment tells up to which alpha it may be skipped: one parameter's need no range of their curvature."""
+    """Return the column in a fragment of the alpha up to which it may be skipped; it differs for one parameter."""
     return BEND if shape.order == 2 else FORM + shape.monomials + 1 + bends_of(shape)
 
 
 @njit(cache=True, error_model="numpy")
 def crossing_rows(shape):
-    """Rows of `ThresholdCrossings` (see `threshold_crossings`)."""
+    """Return the number of rows of `ThresholdCrossings` (see `threshold_crossings`)."""
     d = shape.dimensions
     return CROSSING_FORM + 1 + 2 * d + d * (d + 1) // 2 + CROSSING_RESTRICTED
 
 
 @njit(cache=True, error_model="numpy", forceinline=True)
 def parabola(slope, bend):
-    """Range of +-slope p + bend p^2 over p in [-1, 1], up to rounding, of lanes (design.md, A4)."""
+    """Return the range of +-slope p + bend p^2 over p in [-1, 1], up to rounding, by lane (design.md, A4)."""
     bottom, top = bend - slope, bend + slope
     # the vertex counts where it lies inside [-1, 1]
     inside = slope < 2.0 * abs(bend)
@@ -295,7 +294,7 @@ def parabola(slope, bend):
 
 @njit(cache=True, error_model="numpy", forceinline=True)
 def longest_list(lengths):
-    """The largest of the pixels' ``lengths``."""
+    """Return the largest of the pixels' ``lengths``."""
     longest = 0
     for q in range(PIXELS):
         longest = max(longest, int(lengths[q]))
@@ -328,24 +327,24 @@ def set_unknown(fragments, at, high, m):
 
 @njit(cache=True, error_model="numpy", forceinline=True)
 def crossing_of(fragments, at):
-    """By how much alpha of the fragment at ``at`` may fall where it is skipped; half of it is in its form (B4, B11)."""
+    """Return the largest fall of alpha by skipping the fragment at ``at``; half of it is in its form (B4, B11)."""
     return min(fragments.values[at + fragments.crossing], fragments.values[at + ALPHA_HIGH])
 
 
 @njit(cache=True, error_model="numpy", inline="always")
 def color_size(forms):
-    """Numbers of one colour of the palette."""
+    """Return the count of numbers of one colour of the palette."""
     return 4 * (forms + 3)
 
 
 @njit(cache=True, error_model="numpy", inline="always")
 def color_ends(forms):
-    """Where in a colour of the palette its lower bound stands, before its upper one."""
+    """Return the place in a colour of the palette of its lower bound, which the upper one follows."""
     return 4 * (forms + 1)
 
 
 @njit(cache=True, error_model="numpy", forceinline=True)
 def listed_fragment(fragments, entry, forms):
-    """Where a pixel's fragment stands, its colour in the palette and its row of moves (0: none)."""
+    """Return the places of a pixel's fragment, of its colour in the palette and of its row of moves (0: none)."""
     lists, at = fragments.lists, LISTED * entry
     return (int(lists[at]) * fragments.width, int(lists[at + 1]) * color_size(forms), MOVES * int(lists[at + 2]))

@@ -1,4 +1,4 @@
-"""Pixels and tiles in which projected Gaussians may show (design.md, G8-G12)."""
+"""Finds the pixels and tiles in which projected Gaussians may show (docs/dev/design.md, G8-G12)."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from ns_abstract.methods.splat import projection_errors as row
 
 
 def exponent_limits(opacity_high: np.ndarray, alpha_min: float, charges: Charges) -> np.ndarray:
-    """Exponents [N] from which on opacities [N] leave less than ``alpha_min``, however they are evaluated (B4)."""
+    """Return the exponents [N] above which alpha is below ``alpha_min`` in every evaluation, for opacities [N] (B4)."""
     with np.errstate(divide="ignore"):
         exponent = np.log(opacity_high * (1.0 + charges.opacity) * (1.0 + charges.exponent_limit) / alpha_min)
     # room for the rounding of the exponential, which grows more slowly than the exponent's own error
@@ -33,7 +33,7 @@ def _within(x, most):
 
 @njit(cache=True, error_model="numpy", forceinline=True)
 def ellipse_is_met(sharpness, widest, thinnest, eta, span, charges):
-    """Whether a Gaussian shows hardly anything in tiles that rounding may miss (design.md, G12), by its covariance.
+    """Return whether a Gaussian's alpha is negligible in tiles that rounding may miss, by its covariance (G12).
 
     ``sharpness`` is det / (a c), ``widest`` and ``thinnest`` bound a and c, ``span`` the coordinates in pixels.
     """
@@ -47,7 +47,7 @@ def ellipse_is_met(sharpness, widest, thinnest, eta, span, charges):
 
 @njit(cache=True, error_model="numpy", forceinline=True)
 def largest_extent(s, q):
-    """Upper bound of the largest standard deviation of one lane's Gaussian, up to rounding."""
+    """Return an upper bound of the largest standard deviation of one lane's Gaussian, up to rounding."""
     total = 0.0
     for k in range(9):
         entry = s[row.B00 + k * row.LANES + q]
@@ -57,7 +57,7 @@ def largest_extent(s, q):
 
 @njit(cache=True, error_model="numpy", forceinline=True)
 def projected_stretch(rules, camera):
-    """Upper bound of the norm of z J, up to rounding; 0 where no float32 program is modelled (the paper's rules)."""
+    """Return an upper bound of the norm of z J, up to rounding; 0 for the paper's rules, without float32 program."""
     if rules.view_margin < 0.0:
         return 0.0
     fx, fy, _, _, _, _ = camera
@@ -67,10 +67,10 @@ def projected_stretch(rules, camera):
 
 @njit(cache=True, error_model="numpy")
 def regions(s, n, rules, camera, charges):
-    """Compute regions and tile ranges from the rows of `float_errors` (design.md, G5-G12): rows GONE .. T7.
+    """Compute regions and tile ranges from the rows of `float_errors`: rows GONE .. T7 (design.md, G5-G12).
 
-    GONE is 1 where no pose shows it, KNOWN where its forms may be relied on. The others may cover every pixel. Of a
-    record: the opacities, kappa and the exponent from which on alpha is below the threshold.
+    GONE is 1 where no pose shows the Gaussian, KNOWN where its forms are valid; other Gaussians may cover every pixel.
+    Also sets a record's opacities, kappa and the exponent above which alpha is below the threshold.
     """
     _tile_ranges(s, n, rules, camera, charges)
     _opacities(s, n, rules, charges)
@@ -79,13 +79,13 @@ def regions(s, n, rules, camera, charges):
 
 @njit(cache=True, error_model="numpy", forceinline=True)
 def _tile_side(rules):
-    """Side of a tile, pixels: the program's, or that of the work's division where it has none."""
+    """Return the side of a tile in pixels: the program's, or that of the work's division where it has none."""
     return rules.tile_size if rules.tile_size > 0.0 else float(rules.work_tile)
 
 
 @njit(cache=True, error_model="numpy")
 def _tile_ranges(s, n, rules, camera, charges):
-    """Tiles of the program (design.md, G8, G9, G12): rows T0 .. T7, GONE, FINITE, FRONT, PLACED."""
+    """Compute the program's tiles: rows T0 .. T7, GONE, FINITE, FRONT, PLACED (design.md, G8, G9, G12)."""
     near, far, room, ellipse = rules.near, rules.far, rules.tile_room, rules.ellipse_tiles
     width, height = camera.width, camera.height
     cut = rules.tile_size > 0.0
@@ -153,7 +153,7 @@ def _tile_ranges(s, n, rules, camera, charges):
 
 @njit(cache=True, error_model="numpy")
 def _opacities(s, n, rules, charges):
-    """Opacities, kappa and exponents (design.md, G7, G9, G11): KNOWN, GONE, columns of the record, REGIONLIMIT."""
+    """Compute opacities, kappa and exponents: KNOWN, GONE, columns of the record, REGIONLIMIT (G7, G9, G11)."""
     alpha_min, antialiased = rules.alpha_min, rules.antialiased
     for q in range(n):
         det = s[row.DET + q]
@@ -191,7 +191,7 @@ def _opacities(s, n, rules, charges):
 
 @njit(cache=True, error_model="numpy")
 def _pixel_boxes(s, n, rules, camera):
-    """Pixels where alpha may reach the threshold (design.md, G9): rows BOX0 .. BOX3, GONE, and fewer tiles."""
+    """Compute the pixels where alpha may reach the threshold: rows BOX0 .. BOX3, GONE; reduce tiles to them (G9)."""
     width, height = camera.width, camera.height
     side = _tile_side(rules)
     for q in range(n):

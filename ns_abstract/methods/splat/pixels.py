@@ -1,7 +1,7 @@
-"""Per-pixel stage of the bounds: the tiles of a picture, block by block, on all threads (design.md, B1-B12, R4).
+"""The per-pixel stage of the bounds: the tiles of a picture, block by block, on all threads (design.md, B1-B12, R4).
 
 A block of `PIXELS` pixels passes two steps: `fragments` collects what may be drawn, with alphas from `alphas`, and
-`blend` blends it, each pixel by itself; `pixel_block` tells how fragments are kept.
+`blend` composites it pixel by pixel; `pixel_block` describes the memory.
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ from ns_abstract.methods.splat.work_sharing import run_by_tiles
 
 @njit(cache=True, error_model="numpy")
 def _set_trivial(pixels, left, above, bounds, m):
-    """Bounds of those ``pixels`` of a block of which nothing is known."""
+    """Set the bounds of ``pixels`` of a block to [0, 1], as nothing is known of them."""
     lower, upper, linear = bounds.lower, bounds.upper, bounds.linear
     while pixels != 0:
         q = lowest_bit(pixels)
@@ -52,7 +52,7 @@ def _set_trivial(pixels, left, above, bounds, m):
 
 @njit(cache=True, error_model="numpy")
 def _set_trivial_parts(pixels, left, above, bounds):
-    """`_set_trivial` of the parts or sub-boxes of the cell, where these are asked for."""
+    """Do `_set_trivial` for the parts or sub-boxes of the cell, where these are requested."""
     while pixels != 0 and bounds.parts.shape[0] > 0:
         q = lowest_bit(pixels)
         pixels = signed(pixels & (pixels - 1))
@@ -64,7 +64,7 @@ def _set_trivial_parts(pixels, left, above, bounds):
 
 @njit(cache=True, error_model="numpy", forceinline=True)
 def ray_at(x, y, inputs, ray):
-    """Write the ray [3] of unit depth through the picture's point (x, y) at the cell's middle, world axes."""
+    """Write the ray [3] of unit depth through image point (x, y) at the cell's middle, world axes."""
     camera, direction = inputs.intrinsics, inputs.axes.middle
     u, v = (x - camera.cx) / camera.fx, (y - camera.cy) / camera.fy
     for k in range(3):
@@ -73,10 +73,10 @@ def ray_at(x, y, inputs, ray):
 
 @njit(cache=True, error_model="numpy")
 def _bound_block(numbers, place, inputs, block, bounds):
-    """Bounds of one block of pixels. Returns whether the buffers sufficed.
+    """Bound one block of pixels; return whether the buffers sufficed.
 
-    ``numbers`` are the rows of the Gaussians that may reach it, nearest first; ``bounds`` the tile's parts of
-    `PixelBounds`, where ``linear`` starts with the tile's or is empty and ``statistics`` is the thread's row.
+    ``numbers`` are the rows of the Gaussians that may reach it, nearest first. ``bounds`` is the tile's slice of
+    `PixelBounds`, where ``linear`` starts with the tile's or is empty, and ``statistics`` is the thread's row.
     """
     left, above, m = place.x0 % bounds.lower.shape[0], place.y0 % bounds.lower.shape[0], inputs.shape.monomials
     _set_trivial(signed(~place.wanted), left, above, bounds, m)
@@ -110,7 +110,7 @@ def _bound_block(numbers, place, inputs, block, bounds):
 
 @njit(cache=True, error_model="numpy")
 def borrowed_inputs(inputs):
-    """The `PixelInputs` without references to the arrays' owners."""
+    """Return the `PixelInputs` without references to the arrays' owners."""
     gaussians, axes, colors, parts = inputs.gaussians, inputs.axes, inputs.colors, inputs.parts
     gaussians = ProjectedGaussians(
         borrowed(gaussians.record), borrowed(gaussians.box), borrowed(gaussians.tiles), borrowed(gaussians.depth),
@@ -135,7 +135,7 @@ def borrowed_inputs(inputs):
 
 @njit(cache=True, error_model="numpy")
 def _tile_bounds(bounds, number, thread):
-    """The parts of ``bounds`` that tile ``number`` of those wanted and ``thread`` write."""
+    """Return the slice of ``bounds`` that ``thread`` writes for tile ``number`` of the requested ones."""
     linear, layers, parts = borrowed(bounds.linear), borrowed(bounds.layers), borrowed(bounds.parts)
     return PixelBounds(
         borrowed(bounds.lower)[number], borrowed(bounds.upper)[number], linear[min(number, linear.shape[0]) :],
@@ -146,7 +146,7 @@ def _tile_bounds(bounds, number, thread):
 
 @njit(cache=True, error_model="numpy", nogil=True)
 def _pixel_worker(share, lists, pixels, inputs, bounds):
-    """One thread's tiles; see `ThreadShare` and `pixel_stage`."""
+    """Do one thread's tiles; see `ThreadShare` and `pixel_stage`."""
     sequence, counter = borrowed(share.sequence), pointer(share.counter)
     inputs = borrowed_inputs(inputs)
     camera = inputs.intrinsics
@@ -187,14 +187,14 @@ def _pixel_worker(share, lists, pixels, inputs, bounds):
 
 
 def pixel_stage(lists: TileLists, pixels: np.ndarray, inputs: PixelInputs, bounds: PixelBounds) -> None:
-    """Bounds of the pixels of the tiles ``lists.wanted`` (design.md, B).
+    """Bound the pixels of the tiles ``lists.wanted`` (design.md, B).
 
     Args:
         lists: Of all tiles of the image.
-        pixels: [t, blocks] the set of the pixels of each block that are wanted, blocks row by row; nothing is known of
-            the others.
-        inputs: Of the cell; where it has parts, no linear sets and no layers are found.
-        bounds: The output; one row of its statistics for each thread.
+        pixels: [t, blocks] the set of each block's requested pixels, blocks row by row; others have no meaningful
+            bounds.
+        inputs: Of the cell; if it has parts, there are no linear sets and no layers.
+        bounds: The output, with one row of statistics for each thread.
     """
     run_by_tiles(
         _pixel_worker, longest_first(lists.wanted, lists.offsets), bounds.statistics.shape[0], lists, pixels, inputs,

@@ -1,4 +1,4 @@
-"""The header of a standard 3DGS ``.ply``: its columns, and what its comments say of the picture."""
+"""The header of a standard 3DGS ``.ply``: its columns, and the picture's options in its comments."""
 
 from __future__ import annotations
 
@@ -72,7 +72,7 @@ class PlyElement:
     types: dict[str, str]
 
     def least_size(self, ascii_text: bool) -> int:
-        """Bytes that the rows take at the least."""
+        """Return the least bytes that the rows take."""
         if ascii_text:
             return self.count * max(1, 2 * len(self.types))
         return self.count * sum(_SIZES.get(kind, 1) for kind in self.types.values())
@@ -80,12 +80,12 @@ class PlyElement:
 
 @dataclass(frozen=True)
 class PlyHeader:
-    """What a checked header says.
+    """The content of a checked header.
 
     Attributes:
         bands: K, bands of spherical harmonics.
-        mode: "classic" or "antialiased" where a comment says it.
-        unused: Columns and elements that change nothing here.
+        mode: "classic" or "antialiased" if a comment says so.
+        unused: Columns and elements that have no effect.
     """
 
     vertex: PlyElement
@@ -97,10 +97,10 @@ class PlyHeader:
 
 @dataclass(frozen=True)
 class PlyDeclaration:
-    """What a header declares, checked against the size of the file.
+    """The declarations of a header, checked against the size of the file.
 
     Attributes:
-        mode: "classic" or "antialiased" where a comment says it.
+        mode: "classic" or "antialiased" if a comment says so.
     """
 
     elements: list[PlyElement]
@@ -109,7 +109,7 @@ class PlyDeclaration:
 
 
 def read_declaration(path: Path, mode_given: bool) -> PlyDeclaration:
-    """What the header of ``path`` declares.
+    """Return the declarations in the header of ``path``.
 
     ``mode_given``: whether the user says how to rasterise, so that a comment that cannot be understood does not matter.
     Raises InputError where it is not the header of a .ply of splats, or the file is cut off.
@@ -147,7 +147,7 @@ def read_declaration(path: Path, mode_given: bool) -> PlyDeclaration:
 
 
 def standard_header(declared: PlyDeclaration, path: Path) -> PlyHeader:
-    """The header of a standard 3DGS .ply. Raises InputError where its columns are not those of one."""
+    """Return the header of a standard 3DGS .ply. Raises InputError where its columns are not those of one."""
     vertex = next((element for element in declared.elements if element.name == "vertex"), None)
     if vertex is None or vertex.count < 1:
         raise InputError("no Gaussians", file=path, field="element vertex", fix=FIX)
@@ -160,7 +160,7 @@ def standard_header(declared: PlyDeclaration, path: Path) -> PlyHeader:
 
 
 def read_elements(path: Path, elements: list[PlyElement]) -> dict[str, Any]:
-    """Tables of the named elements, as numpy's structured arrays. Raises InputError where the file is damaged."""
+    """Return tables of the named elements, as numpy's structured arrays. Raises InputError for a damaged file."""
     import plyfile
 
     try:
@@ -179,7 +179,7 @@ def read_elements(path: Path, elements: list[PlyElement]) -> dict[str, Any]:
 
 
 def _comments(text: str, path: Path, mode_given: bool) -> tuple[str | None, str]:
-    """The mode that the last comment about it says, and that comment; (None, "") without one."""
+    """Return the mode in the last comment about it, and that comment; (None, "") without one."""
     mode, said = None, ""
     for line in text.split("\n"):
         words = line.strip().split(None, 1)
@@ -263,7 +263,7 @@ def _bands(vertex: PlyElement, path: Path) -> int:
 
 
 def _parse(header: str, path: Path) -> tuple[bool, list[PlyElement]]:
-    """Whether the data is text, and the declared elements."""
+    """Return whether the data is text, and the declared elements."""
     formats: list[str] = []
     elements: list[PlyElement] = []
     for number, line in enumerate(header.split("\n")[1:], start=2):

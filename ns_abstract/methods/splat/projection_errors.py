@@ -1,18 +1,15 @@
-"""Float errors, pixel regions and tile ranges of projected Gaussians (design.md, G5-G12).
+"""Float errors, pixel regions and tile ranges of projected Gaussians (docs/dev/design.md, G5-G12).
 
-For every Gaussian that some pose of the cell may show, one record is written:
-
+One record is written for every Gaussian that some pose of the cell may show:
     0, 1   mean in pixels at the cell's middle (the point pixel offsets are taken from)
     2, 3   lower and upper opacity
-    4      kappa: relative error of the exponent that float evaluation may add
-    5      1 where nothing but the opacity is known ("unbounded"), else 0
-    6      exponent from which on alpha is below the threshold, however it is evaluated (B4); -1 if unbounded
-    7 ..   of the forms P, Q, S, W1, W2: how far each may be from its centre, for pixels that surely see nothing
-    12 ..  forms P, Q, S, W1, W2 (and K if antialiased; 0 where the opacity is compensated), each m coefficients and
-           a radius
-
+    4      kappa: relative error of the exponent by float evaluation
+    5      1 where only the opacity is known ("unbounded"), else 0
+    6      exponent above which alpha is below the threshold in every evaluation (B4); -1 if unbounded
+    7 ..   largest distances of the forms P, Q, S, W1, W2 from their centres, to find pixels that surely see nothing
+    12 ..  forms P, Q, S, W1, W2 (and K if antialiased; 0 where the opacity is compensated), each m coefficients and a
+        radius
 so that for a pixel at offset (ax, ay) from the mean
-
     y1 = P ax - Q ay - W1,   y2 = S ay - W2,   alpha = opacity exp(-(y1^2 + y2^2)/2 - K).
 """
 
@@ -38,7 +35,7 @@ LANES = 32
 
 @dataclass(frozen=True)
 class RecordTuning:
-    """From where on Gaussians are looked at more closely. None of them decides whether a bound holds."""
+    """When Gaussians get tighter error bounds; soundness does not depend on it."""
 
     #: The squared compensation from which on its logarithm is used.
     least_square: float = 1e-60
@@ -61,7 +58,7 @@ FORMS = SPREAD + 5
 
 @njit(cache=True, error_model="numpy")
 def columns(count, m):
-    """Columns of a record of ``count`` forms of ``m`` monomials: whole cache lines."""
+    """Return the columns of a record of ``count`` forms of ``m`` monomials: whole cache lines."""
     return -(-(FORMS + count * (m + 1)) // 8) * 8
 
 
@@ -109,13 +106,13 @@ FP, FQ, FS, FW1, FW2, FK, FD = range(RECORD + FORMS * LANES, RECORD + (FORMS + 2
 
 @njit(cache=True, error_model="numpy")
 def table_rows(width):
-    """Rows of the scratch for records of ``width`` columns."""
+    """Return the rows of the scratch for records of ``width`` columns."""
     return RECORD // LANES + max(width, (FD - RECORD) // LANES + 4)
 
 
 @njit(cache=True, error_model="numpy")
 def gather_means(candidates, block, scene, origin, s):
-    """Copy the means of the Gaussians ``block`` to the rows V0 .. V2, M0 .. R2; lanes in excess repeat the last one."""
+    """Copy the means of the Gaussians ``block`` to rows V0 .. V2, M0 .. R2; spare lanes repeat the last Gaussian."""
     means, mean_radius = scene.means, scene.mean_radius
     filled = block.shape[0]
     for q in range(LANES):
@@ -128,7 +125,7 @@ def gather_means(candidates, block, scene, origin, s):
 
 @njit(cache=True, error_model="numpy")
 def gather(candidates, block, scene, origin, s):
-    """Copy what the Gaussians ``block`` are made of to the rows V0 .. OPLIMIT; lanes in excess repeat the last one."""
+    """Copy the parameters of the Gaussians ``block`` to rows V0 .. OPLIMIT; spare lanes repeat the last Gaussian."""
     gather_means(candidates, block, scene, origin, s)
     axes, noise, opacity_low, opacity_high, exponent_limits = (
         scene.axes, scene.noise, scene.opacity_low, scene.opacity_high, scene.exponent_limits,
@@ -148,7 +145,7 @@ def gather(candidates, block, scene, origin, s):
 
 @njit(cache=True, error_model="numpy")
 def coordinate_errors(s, n, poses, charges):
-    """Float errors of the camera coordinates and what ranges of means add to them (G2, S2): rows EX .. SZ."""
+    """Compute float errors of the camera coordinates, and their spread by ranges of means: rows EX .. SZ (G2, S2)."""
     rotation_magnitude, camera_magnitude = poses.rotation_magnitude, poses.camera_magnitude
     c0, c1, c2 = camera_magnitude[0], camera_magnitude[1], camera_magnitude[2]
     for row in range(3):
@@ -167,19 +164,19 @@ def coordinate_errors(s, n, poses, charges):
 
 @njit(cache=True, error_model="numpy", forceinline=True)
 def _rotation_row(magnitude, k):
-    """Upper bounds of the absolute entries of row ``k`` of the rotation."""
+    """Return upper bounds of the absolute entries of row ``k`` of the rotation."""
     return magnitude[3 * k], magnitude[3 * k + 1], magnitude[3 * k + 2]
 
 
 @njit(cache=True, error_model="numpy", forceinline=True)
 def _scaled_row(j, ratio, r, r2):
-    """Upper bounds of the absolute entries of a row of J R, from those of the rotation's row ``r`` and third row."""
+    """Return upper bounds of a row of |J R|, from those of the rotation's row ``r`` and third row ``r2``."""
     return j * (r[0] + ratio * r2[0]), j * (r[1] + ratio * r2[1]), j * (r[2] + ratio * r2[2])
 
 
 @njit(cache=True, error_model="numpy", forceinline=True)
 def _applied(f00, f11, f22, f01, f02, f12, g):
-    """A symmetric matrix times a vector."""
+    """Return a symmetric matrix times a vector."""
     return (
         f00 * g[0] + f01 * g[1] + f02 * g[2],
         f01 * g[0] + f11 * g[1] + f12 * g[2],
@@ -194,7 +191,7 @@ def _dot(a, b):
 
 @njit(cache=True, error_model="numpy", forceinline=True)
 def view_limits(rules, camera):
-    """Largest absolute ratios x/z and y/z that the Jacobian is evaluated at; infinite without a margin."""
+    """Return the largest absolute ratios x/z and y/z at which the Jacobian is evaluated; infinite without a margin."""
     fx, fy, cx, cy, width, height = camera
     margin = rules.view_margin
     if margin < 0.0:
@@ -232,7 +229,7 @@ def float_errors(s, n, rules, camera, charges, rotation_magnitude):
 
 @njit(cache=True, error_model="numpy")
 def _mean_errors(s, n, rules, camera, charges):
-    """Depth and mean with their errors, and errors of the Jacobian (design.md, G5, G6): rows ZLOW .. RELJ."""
+    """Compute depth and mean with their errors, and errors of the Jacobian: rows ZLOW .. RELJ (design.md, G5, G6)."""
     fx, fy, cx, cy, _, _ = camera
     limit_x, limit_y = view_limits(rules, camera)
     clamp_x, clamp_y = 0.0, 0.0
@@ -267,7 +264,7 @@ def _mean_errors(s, n, rules, camera, charges):
 
 @njit(cache=True, error_model="numpy")
 def _covariance_errors(s, n, camera, charges, rotation_magnitude):
-    """Set rows A .. EC: bounds of the blurred covariance and its float32 errors, from the rows of `_mean_errors` (G6).
+    """Compute bounds of the blurred covariance and its float32 errors: rows A .. EC, from `_mean_errors` (G6).
 
     TAME is finite where all of them are.
     """
@@ -315,7 +312,7 @@ def _covariance_errors(s, n, camera, charges, rotation_magnitude):
 
 @njit(cache=True, error_model="numpy")
 def _radius_ranges(s, n, rules, charges):
-    """The determinant's error, the radius' range (design.md, G8) and G7's first bound: EDET, RHIGH, RLOW, ETA."""
+    """Compute the determinant's error, the radius' range (G8) and G7's first bound: EDET, RHIGH, RLOW, ETA."""
     for q in range(n):
         z_low, z_high = s[ZLOW + q], s[ZHIGH + q]
         z2_low = z_low * z_low
@@ -348,7 +345,7 @@ def _radius_ranges(s, n, rules, charges):
 
 @njit(cache=True, error_model="numpy")
 def _any_sharp(s, n):
-    """Whether any of the row ETA is above `_FACTORS_MATTER`."""
+    """Return whether any of the row ETA is above `_FACTORS_MATTER`."""
     any_above = False
     for q in range(n):
         any_above = any_above | (s[ETA + q] > _FACTORS_MATTER)
@@ -357,10 +354,10 @@ def _any_sharp(s, n):
 
 @njit(cache=True, error_model="numpy")
 def _factor_errors(s, n, rules, camera, charges, rotation_magnitude):
-    """G7's second bound, from the errors of the factors of G = J R M (design.md, G7, G11): ETA, EDET, ROWX .. GRAMC.
+    """Compute G7's second bound, from the errors of the factors of G = J R M: ETA, EDET, ROWX .. GRAMC (G7, G11).
 
-    The errors are those of the factors, row by row, and of the products in G G^T. Not antialiased, only what is above
-    `_FACTORS_MATTER` is replaced, so that a Gaussian's bounds do not depend on those beside it.
+    The errors are those of the factors, row by row, and of the products in G G^T. Without antialiasing only values
+    above `_FACTORS_MATTER` are replaced, so that a Gaussian's bounds do not depend on its neighbours in a block.
     """
     r0, r1 = _rotation_row(rotation_magnitude, 0), _rotation_row(rotation_magnitude, 1)
     r2 = _rotation_row(rotation_magnitude, 2)
@@ -408,10 +405,10 @@ def _factor_errors(s, n, rules, camera, charges, rotation_magnitude):
 
 @njit(cache=True, error_model="numpy")
 def compensations(s, n, rules, charges):
-    """Bounds of the compensation as it is computed (design.md, G11, G12): rows CTOP .. CHIGHLOG, from `float_errors`.
+    """Compute bounds of the computed compensation: rows CTOP .. CHIGHLOG, from `float_errors` (design.md, G11, G12).
 
-    CTOP bounds it over the cell. Its form leaves a factor between CLOW and CHIGH; where FORMLESS is 1 that is the
-    compensation itself, because its logarithm is not known well enough.
+    CTOP bounds it over the cell. It is its form times a factor between CLOW and CHIGH; where FORMLESS is 1 these bound
+    the compensation itself, because its logarithm is not known well enough.
     """
     eps2d, least, flush = rules.eps2d, rules.compensation_min, charges.flush
     # and the rounding below

@@ -1,4 +1,4 @@
-"""Pixels of a block that a Gaussian may reach, as sets of bits."""
+"""Finds the pixels of a block that a Gaussian may reach, as bit sets."""
 
 from __future__ import annotations
 
@@ -20,10 +20,10 @@ ROW_SHIFT = BLOCK.bit_length() - 1
 
 @njit(cache=True, error_model="numpy")
 def _pixels_within(record, ox, oy, left, right, top, bottom, m, per_pixel):
-    """The set of pixels of a range where the exponent may stay low enough for the threshold.
+    """Return the set of pixels of a range where the exponent may be low enough for the alpha threshold.
 
-    Row by row, sigma >= (near1^2 + near2^2)/2 bounds the columns, where near1 and near2 are what the forms' spread
-    leaves of |y1| and |y2| (design.md, B2). (ox, oy) is the offset of the block's first pixel from the mean.
+    Row by row, sigma >= (near1^2 + near2^2)/2 bounds the columns, where near1 and near2 are lower bounds of |y1| and
+    |y2| (design.md, B2). (ox, oy) is the offset of the block's first pixel from the mean.
     """
     inside = ((2 << (bottom * BLOCK + BLOCK - 1)) - 1) & ~((1 << (top * BLOCK)) - 1)
     unbounded = record[UNBOUNDED] != 0.0
@@ -59,7 +59,7 @@ def _pixels_within(record, ox, oy, left, right, top, bottom, m, per_pixel):
 
 @njit(cache=True, error_model="numpy")
 def _pixels_of(record, box, x0, y0, m, per_pixel):
-    """The set of a block's pixels on which a Gaussian may reach the threshold."""
+    """Return the set of a block's pixels on which a Gaussian may reach the alpha threshold."""
     left = int(math.ceil(min(max(box[0] - 0.5 - x0, 0.0), float(BLOCK))))
     right = int(math.floor(min(max(box[1] - 0.5 - x0, -1.0), BLOCK - 1.0)))
     top = int(math.ceil(min(max(box[2] - 0.5 - y0, 0.0), float(BLOCK))))
@@ -72,7 +72,7 @@ def _pixels_of(record, box, x0, y0, m, per_pixel):
 
 @njit(cache=True, error_model="numpy", forceinline=True)
 def pixels_once(k, listed, entries, per_pixel):
-    """`_pixels_of` list position k, found when first asked for."""
+    """Return `_pixels_of` list position k, computed at first use."""
     if entries.has_pixels[k] == 0:
         entries.has_pixels[k] = 1
         i = listed.numbers[k]
@@ -85,7 +85,7 @@ def pixels_once(k, listed, entries, per_pixel):
 
 @njit(cache=True, error_model="numpy")
 def pixels_at(lanes, pixels):
-    """The set of the pixels that stand in ``pixels`` in these ``lanes``, a set of bits."""
+    """Return the set of the pixels whose numbers are in ``pixels`` in these ``lanes``, a bit set."""
     at = 0
     while lanes != 0:
         at |= 1 << int(pixels[lowest_bit(lanes)])

@@ -104,7 +104,7 @@ def sh_colors(degree: int, directions: Tensor, sh: Tensor) -> Tensor:
 class Reference:
     """Renders one scene.
 
-    ``dtype``: what to compute with. ``torch.float32`` gives one of the pictures that a float32 rasteriser may output.
+    ``dtype``: of the computation. ``torch.float32`` gives one of the pictures that a float32 rasteriser may output.
     """
 
     def __init__(
@@ -127,7 +127,7 @@ class Reference:
             self._background = torch.zeros(3, dtype=dtype)
 
     def scene_sample(self, means: Tensor, opacities: Tensor, color_shift: Tensor | None) -> Reference:
-        """The same scene with other means [N, 3], activated opacities [N] and shifts of activated colours [N, 3].
+        """Return the scene with other means [N, 3], activated opacities [N] and shifts of activated colours [N, 3].
 
         Gradients of `pixels` flow back to them.
         """
@@ -137,13 +137,13 @@ class Reference:
         return other
 
     def recolored(self, colors: Tensor) -> Reference:
-        """The same Gaussians with ``colors`` [N, 3] seen from everywhere, and black behind them."""
+        """Return the same Gaussians with view-independent ``colors`` [N, 3] and a black background."""
         other = copy.copy(self)
         other._plain, other._background = colors.to(self.dtype), torch.zeros(3, dtype=self.dtype)
         return other
 
     def project(self, camera: PinholeCamera, camera_to_world: Tensor, subset: Tensor | None = None) -> Projection:
-        """Project the scene (fully_fused_projection_fwd.cu, isect_tiles.cu); arguments as for `image`.
+        """Return the projected scene (fully_fused_projection_fwd.cu, isect_tiles.cu); arguments as for `image`.
 
         ``subset``: numbers of Gaussians that are known to be drawn: these, without culling; all if None.
         """
@@ -188,7 +188,7 @@ class Reference:
     def _splat(
         self, camera: PinholeCamera, rotation: Tensor, points: Tensor, indices: Tensor
     ) -> tuple[Tensor, Tensor, Tensor]:
-        """Centres [n, 2], covariances [n, 2, 2] before the blur, and their determinants (utils.cuh:255-291)."""
+        """Return centres [n, 2], covariances [n, 2, 2] before the blur, and determinants (utils.cuh:255-291)."""
         margin = self.rules.view_margin
         x, y, z = points.unbind(1)
         u, v = x / z, y / z
@@ -208,9 +208,9 @@ class Reference:
     def _tile_ranges(
         self, camera: PinholeCamera, means2d: Tensor, xx: Tensor, yy: Tensor, det: Tensor, opacities: Tensor
     ) -> tuple[Tensor, Tensor, Tensor]:
-        """Radii [n, 2], tile ranges [n, 4] and whether the Gaussian is drawn [n].
+        """Return radii [n, 2], tile ranges [n, 4] and whether the Gaussian is drawn [n].
 
-        Ellipses are enclosed in boxes: the tiles of a box that the ellipse does not meet show nothing of it.
+        Ellipses are enclosed in boxes: the Gaussian is invisible in the tiles of a box that the ellipse does not meet.
         """
         r = self.rules
         visible = det > 0.0
@@ -240,7 +240,7 @@ class Reference:
         return radii, torch.stack([first[:, 0], past[:, 0], first[:, 1], past[:, 1]], dim=1), visible
 
     def _extents(self, xx: Tensor, yy: Tensor, opacities: Tensor) -> Tensor:
-        """Half-sizes [n, 2] of the box outside of which alpha stays below the threshold."""
+        """Return half-sizes [n, 2] of the box outside of which alpha is below the threshold."""
         if self.rules.alpha_min <= 0.0 or self.dtype != torch.float64:
             return torch.full((len(xx), 2), torch.inf, dtype=self.dtype)
         # alpha >= alpha_min means d^T Sigma^-1 d <= 2 log(opacity / alpha_min); |d_x| <= sqrt(that Sigma_xx)
@@ -248,7 +248,7 @@ class Reference:
         return torch.sqrt(level[:, None] * torch.stack([xx, yy], dim=1)) * (1.0 + PIXEL_ROOM) + PIXEL_ROOM
 
     def _colors(self, indices: Tensor, position: Tensor) -> Tensor:
-        """[n, 3] colours seen from ``position`` [3], world."""
+        """Return colours [n, 3] seen from ``position`` [3], world."""
         if self._plain is not None:
             return self._plain[indices]
         sh = self._sh[indices]
@@ -260,26 +260,26 @@ class Reference:
         return colors if self._shift is None else (colors + self._shift[indices]).clamp(min=0.0)
 
     def _layers(self, p: Projection, order: Tensor, axis: int, low: float, high: float) -> Tensor:
-        """Rows ``order`` of ``p`` that reach pixel centres in [low, high] along one axis (0: x) of one tile."""
+        """Return the rows ``order`` of ``p`` that reach pixel centres in [low, high] along one axis (0: x)."""
         tile = int(low) // self.rules.work_tile
         first, past = p.tiles[order, 2 * axis], p.tiles[order, 2 * axis + 1]
         mean, extent = p.means2d[order, axis].detach(), p.extents[order, axis]
         return order[(first <= tile) & (tile < past) & (mean + extent >= low) & (mean - extent <= high)]
 
     def _blend(self, p: Projection, layers: Tensor, centers: Tensor) -> Tensor:
-        """Composite rows ``layers`` of ``p`` at pixel ``centers`` [k, 2] over the background; [k, 3]."""
+        """Composite rows ``layers`` of ``p`` at pixel ``centers`` [k, 2] over the background; return [k, 3]."""
         color, light = self._sums(p, layers, centers, p.colors)
         return (color + light[:, None] * self._background).clamp(0.0, 1.0)
 
     def _blend_layers(self, p: Projection, layers: Tensor, centers: Tensor) -> Tensor:
-        """Accumulation and expected depth [k, 2], NaN where nothing is drawn (rendering.py of gsplat, RGB+ED)."""
+        """Return accumulation and expected depth [k, 2], NaN where nothing is drawn (gsplat's RGB+ED)."""
         depth, light = self._sums(p, layers, centers, p.depths[:, None])
         accumulation = 1.0 - light[:, None]
         mean = depth / accumulation.clamp(min=ACCUMULATION_MIN)
         return torch.cat([accumulation, torch.where(accumulation > 0.0, mean, torch.nan)], dim=1)
 
     def _sums(self, p: Projection, layers: Tensor, centers: Tensor, colors: Tensor) -> tuple[Tensor, Tensor]:
-        """Weighted sums [k, c] of ``colors`` [n, c] at ``centers`` [k, 2], and the light [k] that is left.
+        """Return weighted sums [k, c] of ``colors`` [n, c] at ``centers`` [k, 2], and the final transmittance [k].
 
         See rasterize_to_pixels_fwd.cu:60-184.
         """
@@ -310,11 +310,11 @@ class Reference:
         return color, light
 
     def image(self, camera: PinholeCamera, camera_to_world: Tensor) -> Tensor:
-        """The picture [H, W, 3] in [0, 1] from ``camera_to_world`` [3, 4], OpenGL axes, not from the camera's pose."""
+        """Return the picture [H, W, 3] in [0, 1] from ``camera_to_world`` [3, 4], OpenGL axes."""
         return self._picture(camera, camera_to_world, self._blend)
 
     def layers(self, camera: PinholeCamera, camera_to_world: Tensor) -> Tensor:
-        """Accumulation and expected depth [H, W, 2], NaN where nothing is drawn; arguments as for `image`."""
+        """Return accumulation and expected depth [H, W, 2], NaN where nothing is drawn; arguments as for `image`."""
         return self._picture(camera, camera_to_world, self._blend_layers)
 
     def _picture(
@@ -336,7 +336,7 @@ class Reference:
         return torch.cat(rows)
 
     def pixels(self, camera: PinholeCamera, camera_to_world: Tensor, pixels: Tensor) -> Tensor:
-        """As `image`, of ``pixels`` [k, 2] (row, column) alone: [k, 3]; gradients cost only the Gaussians there."""
+        """Return `image` at ``pixels`` [k, 2] (row, column) alone: [k, 3]; gradients cost only the Gaussians there."""
         with torch.no_grad():
             p = self.project(camera, camera_to_world)
             order = torch.argsort(p.depths, stable=True)
@@ -363,5 +363,5 @@ def _limit(ratio: Tensor, center: float, size: int, focal: float, margin: float)
 def project(
     scene: SplatScene, camera: PinholeCamera, camera_to_world: Tensor, *, rasteriser: Rasteriser = GSPLAT_1_4_0
 ) -> Projection:
-    """What gsplat's projection and tile stages say about a scene; see `Reference.project`."""
+    """Return the result of gsplat's projection and tile stages for a scene; see `Reference.project`."""
     return Reference(scene, rasteriser).project(camera, camera_to_world)

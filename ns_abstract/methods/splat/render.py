@@ -75,10 +75,10 @@ class _Projected(NamedTuple):
 
 @njit(cache=True, error_model="numpy", inline="always")
 def _covariance(jx, jy, u, v, r0, r1, r2, axes):
-    """Projected covariance a, b, c without the blur, square pixels, and its determinant without cancellation.
+    """Return the projected covariance a, b, c without blur, square pixels, and its determinant without cancellation.
 
-    ``jx``, ``jy`` are focal lengths over depth, (u, v) the clamped ratios, r0, r1, r2 the rotation's rows, ``axes``
-    [3, 3] the Gaussian's.
+    ``jx``, ``jy`` are focal lengths over depth, (u, v) the clamped ratios, r0, r1, r2 the rotation's rows, ``axes`` [3,
+    3] the Gaussian's.
     """
     a0 = jx * (r0[0] - u * r2[0])
     a1 = jx * (r0[1] - u * r2[1])
@@ -105,7 +105,7 @@ def _covariance(jx, jy, u, v, r0, r1, r2, axes):
 
 @njit(cache=True, error_model="numpy", inline="always")
 def _region(mean_x, mean_y, a, b, c, alpha, camera, rules):
-    """Pixels x0, x1, y0, y1 where a Gaussian of covariance a, b, c shows, and whether there is one in the image."""
+    """Return pixels x0, x1, y0, y1 where a Gaussian of covariance a, b, c shows, and whether any is in the image."""
     # pixels where alpha reaches the threshold
     exponent = 2.0 * math.log(alpha / rules.alpha_min) * REGION + LOGARITHM_ROOM
     extent_x = math.sqrt(exponent * a) * REGION
@@ -138,8 +138,8 @@ def _region(mean_x, mean_y, a, b, c, alpha, camera, rules):
 def _set_color(sh, shift, degree, most, i, direction, basis, color):
     """Write the colour of Gaussian i, seen along ``direction`` [3] (not of unit length), to ``color`` [>= 3].
 
-    ``sh``, ``shift``, ``degree`` and ``most`` are of `_SceneArrays`; a record's arrays would all be counted at every
-    call.
+    ``sh``, ``shift``, ``degree`` and ``most`` are those of `_SceneArrays`; numba would count references to a record's
+    arrays at every call.
     """
     if degree == 0:
         for channel in range(3):
@@ -153,7 +153,7 @@ def _set_color(sh, shift, degree, most, i, direction, basis, color):
 
 @njit(cache=True, error_model="numpy", inline="always")
 def _ratio_limits(camera, margin):
-    """Sizes of x/z and y/z, to the left, right, top and bottom, that the Jacobian is clamped to."""
+    """Return magnitudes of x/z and y/z, left, right, top and bottom, to which the Jacobian is clamped."""
     left = right = top = bottom = np.inf
     if margin >= 0.0:
         left = camera.cx / camera.fx + margin * 0.5 * camera.width / camera.fx
@@ -165,10 +165,10 @@ def _ratio_limits(camera, margin):
 
 @njit(cache=True, error_model="numpy", nogil=True)
 def _project_worker(counter_, scene, rotation, position, eye, camera, rules, out):
-    """One thread's Gaussians; see `ns_abstract.methods.splat.constants` for the rules' sources.
+    """Project one thread's Gaussians; see `ns_abstract.methods.splat.constants` for the rules' sources.
 
     ``counter_``: see `run_in_chunks`. The ``rotation`` [3, 3] is from world to camera, OpenCV axes; the camera's
-    ``position`` and ``eye``, where colours are seen from, are [3], world. ``out``: `_Projected`, the output.
+    ``position`` and ``eye``, from which colours are seen, are [3], world. ``out``: `_Projected`, the output.
     """
     counter = pointer(counter_)
     means, axes, opacity = borrowed(scene.means), borrowed(scene.axes), borrowed(scene.opacity)
@@ -243,7 +243,7 @@ _LIGHT, _R, _G, _B, _LIVE = range(0, 5 * PIXELS, PIXELS)
 
 @njit(cache=True, error_model="numpy")
 def _add_gaussian(record, i, ox, oy, n, state, rules):
-    """Blend Gaussian i into the first ``n`` pixels of ``state``, whose first pixel lies at offset (ox, oy)."""
+    """Composite Gaussian i into the first ``n`` pixels of ``state``, whose first pixel is at offset (ox, oy)."""
     p, s, skew, opacity = record[i, _P], record[i, _S], record[i, _Q], record[i, _OPACITY]
     red, green, blue = record[i, _RED], record[i, _RED + 1], record[i, _RED + 2]
     alpha_min, alpha_max, stop = rules.alpha_min, rules.alpha_max, rules.transmittance_min
@@ -269,9 +269,9 @@ def _add_gaussian(record, i, ox, oy, n, state, rules):
 
 @njit(cache=True, error_model="numpy")
 def _blend_block(numbers, pixels, x0, y0, record, box, rules, state):
-    """Blend the Gaussians ``numbers``, nearest first, into a block's ``state`` [5, PIXELS], flat.
+    """Composite the Gaussians ``numbers``, nearest first, into a block's ``state`` [5, PIXELS], flat.
 
-    Of ``pixels``, a set of 64 bits: the others take no light.
+    Only ``pixels``, a set of 64 bits, are drawn.
     """
     for q in range(PIXELS):
         state[_LIGHT + q] = 1.0
@@ -300,9 +300,9 @@ def _blend_block(numbers, pixels, x0, y0, record, box, rules, state):
 
 @njit(cache=True, error_model="numpy", nogil=True)
 def _rasterise_worker(share, lists, sets_, record_, box_, camera, rules, background, image_):
-    """Blend one thread's tiles of ``lists.wanted`` into ``image_`` [t, side, side, 3], in [0, 1].
+    """Composite one thread's tiles of ``lists.wanted`` into ``image_`` [t, side, side, 3], in [0, 1].
 
-    ``sets_`` [t, blocks] int64 holds of each block the pixels that are wanted; the others show the ``background`` [3].
+    ``sets_`` [t, blocks] int64 are the requested pixels of each block; the others show the ``background`` [3].
     ``record_`` and ``box_`` are those of `_Projected`.
     """
     sequence, counter = borrowed(share.sequence), pointer(share.counter)
@@ -342,7 +342,7 @@ def _rasterise_worker(share, lists, sets_, record_, box_, camera, rules, backgro
 
 
 class Renderer:
-    """Renders one scene; keeps its buffers between calls."""
+    """Renders one scene; reuses its buffers between calls."""
 
     def __init__(self, splats: Splats, rasteriser: Rasteriser) -> None:
         n = splats.count
@@ -367,13 +367,13 @@ class Renderer:
         scene_sample: Splats | None = None,
         pixels: np.ndarray | None = None,
     ) -> np.ndarray:
-        """The tiles ``wanted`` (numbers, row-major; all if None) as float64 [t, side, side, 3].
+        """Return the tiles ``wanted`` (numbers, row-major; all if None) as float64 [t, side, side, 3].
 
         Args:
             camera: Intrinsics and size; its own pose is not used.
             rotation: [3, 3] world to camera, OpenCV axes.
             position: [3] camera position, world.
-            scene_sample: What to show in place of the scene: as many Gaussians, of the same degree.
+            scene_sample: The scene to render in place of the stored one: as many Gaussians, of the same degree.
             pixels: [t, side, side] which of the tiles' pixels to draw, others show the background; all if None.
         """
         splats = self.splats if scene_sample is None else scene_sample
@@ -386,7 +386,7 @@ class Renderer:
     def lists(
         self, splats: Splats, camera: PinholeCamera, rotation: np.ndarray, position: np.ndarray, wanted: np.ndarray
     ) -> TileLists:
-        """Project every Gaussian; the lists of the tiles ``wanted``."""
+        """Project every Gaussian, and return the lists of the tiles ``wanted``."""
         scene = _SceneArrays(
             splats.means, splats.axes, splats.opacity, splats.sh, splats.degree, splats.color_shift, splats.color_max
         )
@@ -428,17 +428,17 @@ class Renderer:
     def image(
         self, camera: PinholeCamera, rotation: np.ndarray, position: np.ndarray, scene_sample: Splats | None = None
     ) -> np.ndarray:
-        """The whole image, float64 [H, W, 3] in [0, 1]; see `tiles`."""
+        """Return the whole image, float64 [H, W, 3] in [0, 1]; see `tiles`."""
         return assemble(self.tiles(camera, rotation, position, scene_sample=scene_sample), camera)
 
     def layers(
         self, camera: PinholeCamera, rotation: np.ndarray, position: np.ndarray
     ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """What Splatfacto outputs in evaluation (splatfacto.py:620-665; gsplat's render mode RGB+ED).
+        """Return Splatfacto's outputs in evaluation (splatfacto.py:620-665; gsplat's render mode RGB+ED).
 
         Returns:
-            Image [H, W, 3] and accumulation [H, W, 1] in [0, 1]; expected depth [H, W, 1], the largest
-            one of the image where nothing is hit.
+            Image [H, W, 3] and accumulation [H, W, 1] in [0, 1]; expected depth [H, W, 1], where nothing is hit the
+                largest one of the image.
         """
         whole_image = assemble(self.layer_tiles(camera, rotation, position), camera)
         image, accumulation, depth = whole_image[..., :3], whole_image[..., 3:4], whole_image[..., 4:]
@@ -453,7 +453,7 @@ class Renderer:
         wanted: np.ndarray | None = None,
         scene_sample: Splats | None = None,
     ) -> np.ndarray:
-        """`tiles` with two more channels: [t, side, side, 5].
+        """Return `tiles` with two more channels, [t, side, side, 5].
 
         The fourth is the accumulation, the fifth the expected depth in world units, NaN where nothing is drawn.
         """

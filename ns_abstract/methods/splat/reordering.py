@@ -1,6 +1,6 @@
-"""Bounds of a pixel whose fragments have an uncertain depth order (design.md, O2-O4).
+"""Bounds of a pixel whose fragments have an open depth order (docs/dev/design.md, O2-O4).
 
-SIMD lanes are the three channels, and a fourth one that is not used.
+SIMD lanes 0 to 2 hold the channels; lane 3 is padding.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ from ns_abstract.methods.splat.pixel_block import (
 
 @dataclass(frozen=True)
 class OrderTuning:
-    """When reordering is looked at beyond the swap bound. None of them decides whether a bound holds."""
+    """When reordering is bounded more tightly than by the swap bound; soundness does not depend on it."""
 
     #: Reordering that moves no channel of a pixel by more is not examined beyond the swap bound.
     reordering_matters: float = 1e-4
@@ -48,10 +48,10 @@ class ReorderScratch(NamedTuple):
 
 @njit(cache=True, error_model="numpy")
 def swap_bounds(pairs, slots, block):
-    """Bound what reordering may change when a fragment joins those behind it (design.md, O2).
+    """Bound the change of colours by reordering when a fragment joins those behind it (design.md, O2).
 
-    ``pairs`` and ``slots`` are the numbers of these. The first half of a fragment's row of ``moves`` becomes how much
-    three channels, and one of none, may fall, then rise.
+    ``pairs`` and ``slots`` are their numbers. The first half of a fragment's row of ``moves`` becomes the largest fall
+    of three channels, and of padding, then the largest rise.
     """
     fragments, palette, reordering = block.fragments, block.palette, block.reordering
     colors, forms, moves = palette.values, palette.forms, reordering.moves
@@ -92,9 +92,9 @@ def swap_bounds(pairs, slots, block):
 
 @njit(cache=True, error_model="numpy")
 def _interval_group(start, stop, behind, fragments, palette, moves, scratch):
-    """One step of the interval blend for list entries [start, stop) whose order is uncertain (design.md, O2-O4).
+    """Do one step of the interval blend for list entries [start, stop) of open order (design.md, O2-O4).
 
-    Returns the tighter of the swap, hull and antichain bounds.
+    Returns the tightest of the swap, hull and antichain bounds.
     """
     values, colors, forms = fragments.values, palette.values, palette.forms
     t, keys, order = scratch.numbers, scratch.keys, scratch.order
@@ -140,7 +140,7 @@ def _interval_group(start, stop, behind, fragments, palette, moves, scratch):
 
 @njit(cache=True, error_model="numpy", forceinline=True)
 def _worth_reordering(begin, end, ends, form_low, form_high, fragments, forms, moves):
-    """Whether O3 and O4 may win more than hardly anything where the forms are not tighter anyhow."""
+    """Return whether O3 and O4 may tighten the bounds notably, where forms are not tighter anyway."""
     falls = 0.0 * ends.low
     rises = falls
     for entry in range(begin, end):
@@ -155,9 +155,9 @@ def _worth_reordering(begin, end, ends, form_low, form_high, fragments, forms, m
 
 @njit(cache=True, error_model="numpy", forceinline=True)
 def sharpened(begin, end, ends, form_low, form_high, block, scratch):
-    """Bounds ``ends`` of a pixel whose fragments' depth orders are uncertain, sharpened where that may pay (O4).
+    """Return bounds ``ends`` of a pixel with open depth orders, tightened where that may pay (O4).
 
-    The list entries of the pixel are [begin, end); ``form_low`` and ``form_high`` are its bounds by the forms.
+    The pixel's list entries are [begin, end); ``form_low`` and ``form_high`` are its bounds by forms.
     """
     fragments, palette, moves, group = block.fragments, block.palette, block.reordering.moves, block.entries.far
     lists, forms = fragments.lists, palette.forms

@@ -19,26 +19,25 @@ Float64Array = NDArray[np.float64]
 class SplatScene:
     """The parameters of N Gaussians as stored, before activation.
 
-    Frames and units: world is the run's normalised frame; ``log_scales`` are natural
-    logarithms of standard deviations in that frame.
+    Frames and units: world is the run's normalised frame; ``log_scales`` are natural logarithms of standard deviations
+    in that frame.
 
     Attributes:
         means: [N, 3] float32, world.
         log_scales: [N, 3] float32.
         quats: [N, 4] float32, (w, x, y, z), not necessarily of unit length.
         opacity_logits: [N] float32.
-        sh: [N, K, 3] float32 spherical-harmonics coefficients, K = (degree + 1)^2,
-            band 0 first; for ``color_model`` "sigmoid" K = 1 and holds logits.
-        color_model: "sh" (0.5 + SH, clamped below at 0) or "sigmoid" (nerfstudio trained
-            with ``sh_degree`` 0).
+        sh: [N, K, 3] float32 spherical-harmonics coefficients, K = (degree + 1)^2, band 0 first; for ``color_model``
+            "sigmoid" K = 1 and holds logits.
+        color_model: "sh" (0.5 + SH, clamped below at 0) or "sigmoid" (nerfstudio trained with ``sh_degree`` 0).
         sh_degree: Degree evaluated at render time (0 to 3).
         rasterize_mode: "classic" or "antialiased" (opacity compensation).
         background: [3] float32 RGB shown where nothing is opaque.
-        dataparser: Units of the training data against the normalised frame.
+        dataparser: Units of the training data relative to the normalised frame.
         dropped: Count of stored Gaussians that gsplat can never draw, by reason.
         stored: [N] numbers of the Gaussians in the source, ascending, where some were dropped; else None.
-        notes: What was assumed where the source says nothing, one sentence each.
-        assumptions: What was decided of the picture, and where each choice came from.
+        notes: Sentences on what was assumed where the source does not say.
+        assumptions: Choices that affect the picture, and where each came from.
         gaussians_alone: Whether the run's model draws more than these Gaussians, so that bounds are of them alone.
     """
 

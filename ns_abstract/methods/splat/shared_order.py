@@ -20,7 +20,7 @@ from ns_abstract.refine.protocol import Bounds
 
 @dataclass(frozen=True)
 class SharedOrderTuning:
-    """How many orders are looked at. None of the numbers decides whether a bound holds."""
+    """How many orders are bounded; soundness does not depend on it."""
 
     #: Gaussians of uncertain order that are permuted, and orders in all.
     most_permuted: int = 4
@@ -31,7 +31,7 @@ _TUNING = SharedOrderTuning()
 
 
 class BoundedFrame(Protocol):
-    """What a splat frame has, see `ns_abstract.methods.splat.frame.SplatFrame`."""
+    """The interface of a splat frame that is needed here; see `ns_abstract.methods.splat.frame.SplatFrame`."""
 
     bounds: SubBoxBounds
     order: int
@@ -40,15 +40,15 @@ class BoundedFrame(Protocol):
         self, box: ParameterBox, tiles: np.ndarray, within: Any = None, keep_linear: bool = False,
         pixels: np.ndarray | None = None,
     ) -> Bounds:  # fmt: skip
-        """Bounds of some pixels over a cell."""
+        """Return bounds of some pixels over a cell."""
         ...
 
 
 class _SharedOrderBounds(SubBoxBounds):
-    """Bounds in one given order; or, while there is none, in all orders, with a record of what decides them.
+    """Bounds in one given depth order; without one, in all orders, recording the quantities that decide them.
 
     Attributes:
-        ranks: [N] places of the scene's Gaussians in the order; None: none is given.
+        ranks: [N] positions of the scene's Gaussians in the order; None: no order is given.
         numbers, delta, depth, error: Of the Gaussians that the last cell may show: numbers in the scene [k], means
             minus the cell's origin [k, 3], depths at its middle [k] and their float errors [k].
         slope: [m + 1, 3] the form of the viewing axis, its radius last.
@@ -82,7 +82,7 @@ class _SharedOrderBounds(SubBoxBounds):
 
 
 def shared_order(first: BoundedFrame, second: BoundedFrame) -> SplatOrder | None:
-    """What two frames of the same poses share; None where no two Gaussians have one mean, or the programs differ."""
+    """Return the order that two frames of the same poses share; None where no means are equal, or programs differ."""
     a, b = first.bounds, second.bounds
     same = a.rasteriser == b.rasteriser and a.arithmetic == b.arithmetic and a.rasteriser.name == "gsplat"
     if not same or a.varied.varies or b.varied.varies or first.order != second.order:
@@ -92,9 +92,9 @@ def shared_order(first: BoundedFrame, second: BoundedFrame) -> SplatOrder | None
 
 
 def matched(first: np.ndarray, second: np.ndarray) -> np.ndarray | None:
-    """[M] for each of the means ``second`` [M, 3] the number of an equal one of ``first`` [N, 3], or N and more.
+    """Return [M] for each of the means ``second`` [M, 3] the number of an equal one of ``first`` [N, 3], or N and more.
 
-    Numbers of equal means ascend, so that what is drawn first of equal depths is the same in both. None: none is equal.
+    Numbers of equal means ascend, so that equal depths are drawn in the same order in both. None: no means are equal.
     """
     count = len(first)
     if first.shape == second.shape and np.array_equal(first, second):
@@ -111,7 +111,7 @@ def matched(first: np.ndarray, second: np.ndarray) -> np.ndarray | None:
 
 
 class SplatOrder:
-    """The order that two scenes share; see `ns_abstract.refine.protocol.SharedOrder` (design.md, Y5).
+    """The order that two scenes share; see `ns_abstract.refine.protocol.SharedOrder` (docs/dev/design.md, Y5).
 
     Args:
         names: [M] names of the second scene's Gaussians; those of the first one's are their numbers, see `matched`.
@@ -146,7 +146,7 @@ class SplatOrder:
         return by_order
 
     def _orders(self, visible: list[Any]) -> list[np.ndarray] | None:
-        """[names] ranks of the Gaussians that either scene may show, for every order that they may have."""
+        """Return ranks [names] of the Gaussians that either scene may show, for every order; None: too many."""
         names, parts = [], []
         for bounds, scene_names, context in zip(self._bounds, self.names, visible, strict=True):
             some = np.isin(bounds.numbers, context.visible)
@@ -173,7 +173,7 @@ class SplatOrder:
 
 
 def uncertain(delta: np.ndarray, error: np.ndarray, slope: np.ndarray) -> np.ndarray:
-    """[k, k] whether the depth order of two Gaussians may be either in the cell (design.md, O1, Y5).
+    """Return [k, k] whether two Gaussians may have either depth order in the cell (design.md, O1, Y5).
 
     Args:
         delta: [k, 3] means minus the cell's origin.
@@ -193,7 +193,7 @@ def uncertain(delta: np.ndarray, error: np.ndarray, slope: np.ndarray) -> np.nda
 
 
 def groups(open_pairs: np.ndarray) -> Iterator[tuple[int, int]]:
-    """Ranges of list positions that no uncertain pair leaves, in order (design.md, O4)."""
+    """Yield ranges of list positions such that no open pair spans two of them, in order (design.md, O4)."""
     begin, reach = 0, 0
     for k, row in enumerate(open_pairs):
         reach = max(reach, k, int(np.flatnonzero(row).max(initial=0)))
@@ -203,7 +203,7 @@ def groups(open_pairs: np.ndarray) -> Iterator[tuple[int, int]]:
 
 
 def extensions(open_pairs: np.ndarray, begin: int) -> Iterator[list[int]]:
-    """Orders of the list positions from ``begin`` on that keep every pair that is not uncertain."""
+    """Yield the orders of the list positions from ``begin`` on in which every decided pair keeps its order."""
     count = len(open_pairs)
     for order in itertools.permutations(range(count)):
         if all(i < j or open_pairs[i, j] for i, j in itertools.combinations(order, 2)):

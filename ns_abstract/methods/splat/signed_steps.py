@@ -32,9 +32,9 @@ def signed_gradient_step(
     """Return a pose of ``box`` and a scene of the set one signed-gradient step uphill (design.md, V12).
 
     Args:
-        poses, varied, box: The set of poses, the set of scenes, the parameters that the pose may have.
+        poses, varied, box: The pose set, the set of scenes, the range of the pose's parameters.
         values, scene_sample: Where the step begins.
-        score: What is to grow, of a picture or of pixels and of the pose's parameters.
+        score: The score to raise, of a picture or of pixels and of the pose's parameters.
         size: Length in half-widths of every range; 2 goes from one end to the other. The step ends in the set.
     """
     shift = torch.from_numpy(scene_sample.color_shift.copy()) if scene_sample.color_shift.size else None
@@ -67,7 +67,7 @@ def signed_gradient_step(
 
 
 def _sign(leaf: torch.Tensor | None) -> Float64Array:
-    """The gradient's signs; 0 where there is none."""
+    """Return the gradient's signs; 0 where there is none."""
     if leaf is None or leaf.grad is None:
         return np.zeros(1 if leaf is None else tuple(leaf.shape))
     return np.sign(np.nan_to_num(leaf.grad.numpy()))

@@ -23,11 +23,11 @@ PART_LANES = 8
 
 
 class FormShape(NamedTuple):
-    """The forms of a cell, as `Basis` tells: ``order`` 2 for one parameter, else 1.
+    """The shape of a cell's forms: those of `Basis`, with ``order`` 2 for one parameter, else 1.
 
-    Pixels have no forms where the cell has ``parts``, over which intervals bound them (B12). Their forms are bounded
-    over each of its ``sub_boxes``, too, where it has some (B13). Parts divide the axes of the parameters, or
-    ``by_motion`` the two of the image motion (B16).
+    Pixels have no forms where the cell has ``parts``, over which intervals bound them (B12). With ``sub_boxes`` their
+    forms are bounded over each of these, too (B13). Parts divide the axes of the parameters, or ``by_motion`` the two
+    of the image motion (B16).
     """
 
     dimensions: int
@@ -39,7 +39,7 @@ class FormShape(NamedTuple):
 
 
 def form_shape(basis: Basis, parts: int = 0, sub_boxes: int = 0, by_motion: bool = False) -> FormShape:
-    """``basis`` as kernels take it. Raises ValueError: curvature is kept for one parameter only."""
+    """Return ``basis`` as kernels take it. Raises ValueError: curvature is kept for one parameter only."""
     if basis.order == 2 and basis.dimensions != 1:
         raise ValueError(f"forms of order 2 have one parameter, not {basis.dimensions}")
     if basis.order == 2 and parts:
@@ -48,7 +48,7 @@ def form_shape(basis: Basis, parts: int = 0, sub_boxes: int = 0, by_motion: bool
 
 
 class SceneGaussians(NamedTuple):
-    """What the per-Gaussian stage reads of a scene's N Gaussians.
+    """The arrays of a scene's N Gaussians that the per-Gaussian stage reads.
 
     Attributes:
         means: [N, 3] world, in the middle of their ranges.
@@ -75,7 +75,7 @@ class CellPoses(NamedTuple):
 
     Attributes:
         rotation: [rows, 9] forms, world to camera, OpenCV axes, row-major.
-        offset: [rows, 3] forms of what is added to rotated means minus ``origin``, world units.
+        offset: [rows, 3] forms of the offset that is added to rotated means minus ``origin``, world units.
         origin: [3] world.
         camera_magnitude: [3] upper bounds of the absolute camera coordinates, world.
         rotation_magnitude: [9] upper bounds of the absolute entries of the rotation.
@@ -89,7 +89,7 @@ class CellPoses(NamedTuple):
 
 
 class ProjectionInputs(NamedTuple):
-    """All that the per-Gaussian stage reads."""
+    """All inputs of the per-Gaussian stage."""
 
     scene: SceneGaussians
     poses: CellPoses
@@ -100,11 +100,11 @@ class ProjectionInputs(NamedTuple):
 
 
 class SceneColors(NamedTuple):
-    """What the colours of a scene's N Gaussians are made of.
+    """The inputs for the colours of a scene's N Gaussians.
 
     Attributes:
         means, mean_radius: See `SceneGaussians`.
-        low, high: [N, 3] ranges of what is added to the colours, or [0, 3].
+        low, high: [N, 3] ranges of shifts that are added to the colours, or [0, 3].
         sh: [N, K, 3] coefficients of the spherical harmonics.
         magnitudes: [N, 6] see `colors.color_magnitudes`.
         degree: Highest band.
@@ -140,13 +140,13 @@ class ProjectedGaussians(NamedTuple):
 
 
 class ProjectedCell(NamedTuple):
-    """The candidates of a cell as its pixels see them, in memory that the next projection of the same lane takes.
+    """The projected candidates of a cell, in memory that the next projection of the same thread group reuses.
 
     Attributes:
         candidates: [n] scene indices.
         poses: Of the cell.
         gaussians: Their forms.
-        alive: [k] places among the candidates of those that some pose shows.
+        alive: [k] positions among the candidates of those that some pose shows.
         colors, background, color_error: See `Colors`.
     """
 
@@ -160,12 +160,12 @@ class ProjectedCell(NamedTuple):
 
 
 class ViewingAxes(NamedTuple):
-    """How the camera looks over a cell.
+    """The camera's axes over a cell.
 
     Attributes:
-        depth: [rows, 3] forms of the rotation's third row, world to camera; its radii hold its float error, too.
+        depth: [rows, 3] forms of the rotation's third row, world to camera; radii include its float error.
         middle: [9] the middle pose's rotation, world to camera, row-major.
-        tied: Whether Gaussians of equal ``delta`` have equal depths in the program, and so keep the order of numbers.
+        tied: Whether Gaussians of equal ``delta`` have equal depths in the program, and so are ordered by number.
     """
 
     depth: np.ndarray
@@ -181,8 +181,8 @@ class Colors(NamedTuple):
             m.
         background: [3].
         error: Bound of the colours' float error, added to every result.
-        channels: 3; or 4, the last of which is a form of the depth against ``common``, world units.
-        common: [m + 1] form that all depths are counted from.
+        channels: 3; or 4, the last of which is a form of the depth less ``common``, world units.
+        common: [m + 1] form that is subtracted from all depths.
     """
 
     values: np.ndarray
@@ -193,13 +193,13 @@ class Colors(NamedTuple):
 
 
 class Cutoffs(NamedTuple):
-    """Cut-offs below which effects are bounded but not tracked.
+    """Cut-offs below which effects are bounded but not followed.
 
     Attributes:
-        floor: Fragments are left out where no pose lets more light come to them (B6); none if negative.
-        fade: Bound of the program's rounding when it adds up what was left out, in units of the brightest colour.
-        negligible: Bound of what all fragments that were left out for a negligible alpha may add up to.
-        pairs: Most depth-order pairs looked at in one block of pixels.
+        floor: Fragments are left out where no pose lets more light reach them (B6); none if negative.
+        fade: Bound of the program's rounding when it adds up omitted fragments, in units of the brightest colour.
+        negligible: Bound of the sum of all fragments omitted for a negligible alpha.
+        pairs: Largest number of depth-order pairs considered in one block of pixels.
     """
 
     floor: float
@@ -209,12 +209,12 @@ class Cutoffs(NamedTuple):
 
 
 class SubBoxes(NamedTuple):
-    """Equal sub-boxes of a cell over which pixels' forms are bounded (design.md, B13).
+    """Equal sub-boxes of a cell over which pixels' forms are bounded (docs/dev/design.md, B13).
 
     Attributes:
         counts: [d] numbers of them along the axes, powers of two, at least `PART_LANES` together.
-        levels: Values of a channel. Only where one of them lies between the ends over a sub-box are these made as
-            narrow as they can be; none: everywhere.
+        levels: Values of a channel. Bounds over a sub-box are as tight as possible only where one of these lies between
+            them; no levels: everywhere.
     """
 
     counts: np.ndarray
@@ -222,13 +222,13 @@ class SubBoxes(NamedTuple):
 
 
 class Parts(NamedTuple):
-    """Equal parts of a cell, at places and of widths in [-1, 1] (design.md, B12, B13, B16).
+    """Equal parts of a cell, with positions and widths in [-1, 1] (docs/dev/design.md, B12, B13, B16).
 
     Attributes:
         middles: [axes, parts].
         half: [axes] half-widths.
-        slope: [axes] turns the sum of ``middles`` times the ends of a quantity over the parts into its slope; 0 where
-            an axis is not divided.
+        slope: [axes] factors: the sum of ``middles`` times the ends of a quantity over the parts, times this, is its
+            slope; 0 where an axis is not divided.
         levels: See `SubBoxes`.
         motion, side: See `MotionCells`; [0, 4, d]: axes are those of the parameters.
     """
@@ -242,10 +242,9 @@ class Parts(NamedTuple):
 
 
 def check_parts(counts: np.ndarray, dimensions: int) -> None:
-    """Refuse numbers of parts along axes that `cell_parts` and kernels do not take.
+    """Raise ValueError for numbers of parts along axes that `cell_parts` and kernels do not take.
 
-    Raises:
-        ValueError: They are not ``dimensions`` powers of two, at least `PART_LANES` together.
+    They must be ``dimensions`` powers of two, at least `PART_LANES` together.
     """
     one_bit = counts.shape == (dimensions,) and bool(np.all((counts > 0) & (counts & (counts - 1) == 0)))
     if not one_bit or counts.prod() % PART_LANES:
@@ -253,9 +252,9 @@ def check_parts(counts: np.ndarray, dimensions: int) -> None:
 
 
 def cell_parts(counts: np.ndarray, overlap: float = 0.0, levels: Sequence[float] = ()) -> Parts:
-    """The parts of a cell, ``counts`` [axes] of them along its axes: powers of two, so that all is exact (B12).
+    """Return the parts of a cell, ``counts`` [axes] of them along its axes: powers of two, so that all is exact (B12).
 
-    They reach beyond their ends by ``overlap`` of the cell's half-width.
+    They extend beyond their ends by ``overlap`` of the cell's half-width.
     """
     middles = part_middles(counts)
     squares = np.square(middles).sum(axis=1)
@@ -265,12 +264,12 @@ def cell_parts(counts: np.ndarray, overlap: float = 0.0, levels: Sequence[float]
 
 
 class Strips(NamedTuple):
-    """Strips of `PART_LANES` sub-boxes of a cell, one after the other (design.md, B14).
+    """Strips of `PART_LANES` sub-boxes of a cell, one after the other (docs/dev/design.md, B14).
 
     Attributes:
-        middles: [d, room] at places in [-1, 1]; those beyond the last strip repeat it.
-        half: [d] by how much the middles of a strip's sub-boxes differ from the strip's.
-        room: Whole lanes of strips.
+        middles: [d, room] positions in [-1, 1]; those beyond the last strip repeat it.
+        half: [d] distances of the sub-boxes' middles from their strip's middle.
+        room: Length of rows, whole lanes.
     """
 
     middles: np.ndarray
@@ -283,10 +282,10 @@ _MOST_STRIPS = 63
 
 
 def strips_of(parts: Parts) -> Strips:
-    """Those of the sub-boxes ``parts``.
+    """Return the strips of the sub-boxes ``parts``.
 
     Raises:
-        ValueError: They are more than sets of strips hold, so that some would stay without what they show.
+        ValueError: There are more than sets of strips can hold.
     """
     lanes = parts.middles.reshape(parts.half.size, -1, PART_LANES)
     if lanes.shape[1] > _MOST_STRIPS:
@@ -300,12 +299,12 @@ def strips_of(parts: Parts) -> Strips:
 
 
 class ColorEnds(NamedTuple):
-    """Ends of the Gaussians' colours over a cell: the least of three channels, signs changed, then the most (B14).
+    """Ends of the Gaussians' colours over a cell: the least of three channels, negated, then the largest (B14).
 
     Attributes:
         values: [6, n] colours.
         background: [6].
-        opposite: [6] least of all colours of the row and of the background, where the row holds the most.
+        opposite: [6] least of all colours of the row and of the background, for rows of largest ones.
         bright: Greatest absolute value of any colour, at least 1.
     """
 
@@ -322,14 +321,14 @@ class PixelBounds(NamedTuple):
         lower, upper: [t, side, side, 3].
         linear: [t, side, side, 3, m + 1] forms before the clamp, or empty.
         slopes: [t, d] sums of absolute linear coefficients, added to.
-        statistics: [threads, 5] blocks, fragments of the longest lists, uncertain pairs, blocks where too many pairs
-            were uncertain, pixels with results that were not numbers.
+        statistics: [threads, 5] blocks, fragments of the longest lists, open pairs, blocks with too many open pairs,
+            pixels with results that were not numbers.
         layers: [t, side, side, 4] bounds of the accumulation, and of the expected depth where anything is drawn (see
             `depths`; infinity before its negative: nothing can be), or empty.
-        parts: [t, side, side, 6, parts] least of the three channels and most in each part or sub-box of the cell, where
-            pixels are wanted, or empty.
-        marks: [n] uint8; set to 1 for every Gaussian that some wanted pixel of these tiles may draw or stop at. Those
-            that stay 0 are hidden or too faint for every pose: leaving them out changes nothing.
+        parts: [t, side, side, 6, parts] least of the three channels and largest in each part or sub-box of the cell,
+            for requested pixels, or empty.
+        marks: [n] uint8; set to 1 for every Gaussian that some requested pixel of these tiles may draw or terminate at.
+            Those that stay 0 are hidden or too faint for every pose: leaving them out changes nothing.
     """
 
     lower: np.ndarray
@@ -343,16 +342,16 @@ class PixelBounds(NamedTuple):
 
 
 class PixelInputs(NamedTuple):
-    """All that the pixel stage reads of a cell.
+    """All inputs of the pixel stage for a cell.
 
     Attributes:
         gaussians: Projected.
-        axes: What decides their order.
+        axes: The viewing axes, which decide the depth order.
         intrinsics: The camera's.
         colors: Of the Gaussians.
         rules: The rasteriser's.
         charges: For the program's rounding.
-        cutoffs: What is left out.
+        cutoffs: For omitted fragments.
         shape: Of the Gaussians' forms.
         parts: Of the cell, or its sub-boxes, where ``shape`` has some.
     """

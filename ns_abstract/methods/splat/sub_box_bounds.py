@@ -30,7 +30,7 @@ class SubBoxBounds(SplatBounds):
     """`SplatBounds` with bounds over sub-boxes; takes the same arguments."""
 
     def warm_up(self, camera: PinholeCamera, forms: PoseForms, counts: np.ndarray) -> None:
-        """Compile what `by_depth_ranges` needs; arguments are as there."""
+        """Compile the kernels of `by_depth_ranges`; arguments are as there."""
         pixels = np.ones((1, self.side, self.side), bool)
         goals = np.full((pixels.size, 6), np.inf)
         self.by_depth_ranges(camera, forms, self.project(camera, forms), np.arange(1), pixels, counts, goals)
@@ -39,17 +39,18 @@ class SubBoxBounds(SplatBounds):
         self, camera: PinholeCamera, forms: PoseForms, projected: ProjectedCell, wanted: np.ndarray,
         pixels: np.ndarray, counts: np.ndarray | MotionCells, goals: np.ndarray, crowded: np.ndarray,
     ) -> np.ndarray:  # fmt: skip
-        """Bounds [n, 6, k] of the ``n`` ``pixels`` of the tiles ``wanted`` over sub-boxes (design.md, B12, B14).
+        """Return bounds [n, 6, k] of the ``n`` ``pixels`` of the tiles ``wanted`` over sub-boxes (design.md, B12, B14).
 
-        They are the least of the three channels, then the most; 0 and 1 where nothing is known, or was wanted.
+        They are the least of the three channels, then the largest; 0 and 1 where none is known or needed.
 
         Args:
             camera, forms, wanted, pixels: As of `cell`.
-            projected: What `project` returns of the cell, at least of the Gaussians that may be seen on ``pixels``.
+            projected: The result of `project` for the cell, at least of the Gaussians that may be visible on
+                ``pixels``.
             counts: [d] sub-boxes along the cell's axes, powers of two, at least `PART_LANES` together; or cells of the
                 image motion in their place.
             goals: [n, 6] see `depth_range_stage`.
-            crowded: [n] the pixels at which pairs of uncertain order are too many: ranges of depths bound these.
+            crowded: [n] the pixels with too many pairs of open order: ranges of depths bound these.
         """
         shape, _ = divided_by(forms.rotation.basis, counts, SUB_BOX_OVERLAP)
         ends, unknown = np.empty((len(goals), 6, shape.parts)), crowded
@@ -71,7 +72,7 @@ class SubBoxBounds(SplatBounds):
         self, camera: PinholeCamera, forms: PoseForms, projected: ProjectedCell, wanted: np.ndarray,
         pixels: np.ndarray, counts: np.ndarray | MotionCells, goals: np.ndarray,
     ) -> np.ndarray:  # fmt: skip
-        """Bounds [n, 6, k] of the ``n`` ``pixels`` from the ranges of the Gaussians' depths (design.md, B14).
+        """Return bounds [n, 6, k] of the ``n`` ``pixels`` from the ranges of the Gaussians' depths (design.md, B14).
 
         Arguments are those of `sub_boxes`.
         """
@@ -99,7 +100,7 @@ class SubBoxBounds(SplatBounds):
 
 
 def channel_differences(projected: ProjectedCell) -> tuple[ProjectedCell, float]:
-    """The cell with differences of channels for colours, in memory of its own, and their scale (design.md, B15).
+    """Return the cell with differences of channels as colours, in memory of its own, and their scale (B15).
 
     The three channels are ``1/2 + scale * (first - second)`` for the pairs of `CHANNEL_DIFFERENCES`. The scale keeps
     them in [0, 1]; it is 0 where colours have no finite bound.
@@ -131,7 +132,7 @@ def channel_differences(projected: ProjectedCell) -> tuple[ProjectedCell, float]
 
 
 def _color_ends(colors: np.ndarray, alive: np.ndarray, background: np.ndarray) -> ColorEnds:
-    """The ends of rows ``alive`` of `Colors.values`."""
+    """Return the ends of the rows ``alive`` of `Colors.values`."""
     parts = colors[alive].reshape(alive.size, 3, colors.shape[1] // 3)
     spread = np.abs(parts[..., 1:]).sum(axis=-1) * UP
     ends = np.concatenate([spread - parts[..., 0], spread + parts[..., 0]], axis=1).T
@@ -144,7 +145,7 @@ def _color_ends(colors: np.ndarray, alive: np.ndarray, background: np.ndarray) -
 
 
 def part_ends(ends: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Lower and upper bounds [n, 3, k] of the colours from what `SubBoxBounds.sub_boxes` returns."""
+    """Return lower and upper bounds [n, 3, k] of the colours from the result of `SubBoxBounds.sub_boxes`."""
     lower, upper = ends[:, :COLORS], ends[:, COLORS:]
     # crossed or not a number: nothing is known
     sane = lower <= upper
@@ -152,7 +153,7 @@ def part_ends(ends: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 
 def difference_ends(ends: np.ndarray, scale: float) -> tuple[np.ndarray, np.ndarray]:
-    """Bounds [n, 3, k] of `CHANNEL_DIFFERENCES`, from ``ends`` for those of the colours (design.md, B15)."""
+    """Return bounds [n, 3, k] of `CHANNEL_DIFFERENCES`, from ``ends`` of the scaled colours (design.md, B15)."""
     lower, upper = ends[:, :COLORS], ends[:, COLORS:]
     # [0, 1] stands for nothing that is known (design.md, B15)
     sane = (lower <= upper) & ~((lower == 0.0) & (upper == 1.0)) & (scale > 0.0)

@@ -1,19 +1,18 @@
-"""Alpha-threshold crossings of a pixel's fragments, bounded jointly over parts of the cell (design.md, B11).
+"""Bounds the alpha-threshold crossings of a pixel's fragments jointly over parts of the cell (docs/dev/design.md, B11).
 
-Where alpha passes the threshold, a fragment is drawn on one side and skipped on the other. A pixel is blended as if
-none of them were skipped; what skipping takes away is a sum of one term for each, which is bounded here: from above and
-from below by one plane for each term, chosen by where the sum is likely to be largest, in each of `_PARTS` parts.
+Where alpha crosses the threshold, a fragment is drawn on one side and skipped on the other. A pixel is composited as if
+no fragment were skipped. The change by skipping is a sum of one term for each fragment. Here the sum is bounded, in
+each of `_PARTS` parts, by one plane above and one below each term, chosen where the sum is likely to be largest.
 
 Rows of `ThresholdCrossings.rows` hold a number of each fragment, and before them, in the first lanes, of the three
 channels' blends:
-
     0        radius of the form of alpha, before the threshold
     1        greatest alpha
     2        alpha up to which the fragment may be skipped
-    3, 4     sizes of the form's numbers and of the weights, for rounding
-    5 .. 10  weights of what it takes away, in the upper bounds of three channels and in the lower ones
+    3, 4     magnitudes of the form's numbers and of the weights, for rounding
+    5 .. 10  weights of the change by skipping, in the upper bounds of three channels and in the lower ones
     11 ..    the form: centre, slopes, products of two parameters
-    then     the same over a part: centre, slopes, ends of what else there is, two planes above and two below, scratch
+    then     the same over a part: centre, slopes, ends of the other terms, two planes above and two below, scratch
 """
 
 from __future__ import annotations
@@ -49,7 +48,7 @@ from ns_abstract.methods.splat.pixel_block import (
 
 @dataclass(frozen=True)
 class CrossingTuning:
-    """Planes that skipped fragments are bounded by. None of them decides whether a bound holds."""
+    """Preferences on the planes that bound skipped fragments; soundness does not depend on them."""
 
     #: Planes whose steepness would divide by less than this part of the threshold are left out.
     steep: float = 2.0**-20
@@ -68,22 +67,22 @@ assert CROSSING_FORM == _WEIGHTS + 6 and CROSSING_RESTRICTED == _SCRATCH + 1
 
 @njit(cache=True, error_model="numpy", forceinline=True)
 def _restricted_rows(d):
-    """The first row of forms over a part."""
+    """Return the first row of forms over a part."""
     return CROSSING_FORM + 1 + d + d * (d + 1) // 2
 
 
 @njit(cache=True, error_model="numpy", forceinline=True)
 def crossing_columns(count):
-    """Columns of `ThresholdCrossings.rows` in use: whole lanes."""
+    """Return the columns of `ThresholdCrossings.rows` in use: whole lanes."""
     return CROSSING_LANES + -(-count // CROSSING_LANES) * CROSSING_LANES
 
 
 @njit(cache=True, error_model="numpy")
 def gather_crossings(begin, end, count, since, fragments, crossings, out, shape):
-    """Fill the rows of ``count`` fragments of the list entries [begin, end), and bound what skipping changes (B11).
+    """Fill the rows of ``count`` fragments of the list entries [begin, end), and bound the change by skipping (B11).
 
-    By channel, only those from number ``since`` [4] on count. ``out`` [16] receives by how much it lowers and raises
-    the channels at most, without regard to where; the rest is scratch.
+    By channel, only those from number ``since`` [4] on count. ``out`` [16] receives the largest fall and rise of the
+    channels wherever fragments are skipped; the rest is scratch.
     """
     values, rows, room, d = fragments.values, crossings.rows, crossings.room, shape.dimensions
     bends = d * (d + 1) // 2
@@ -145,7 +144,7 @@ def gather_crossings(begin, end, count, since, fragments, crossings, out, shape)
 
 @njit(cache=True, error_model="numpy")
 def set_blend(polynomials, radii, crossings, d):
-    """Write ``polynomials`` [., 4] and ``radii`` [4] of the three channels before the fragments' forms."""
+    """Write ``polynomials`` [., 4] and ``radii`` [4] of the three channels in front of the fragments' forms."""
     rows, room = crossings.rows, crossings.room
     for channel in range(CROSSING_LANES):
         size = 0.0
@@ -159,7 +158,7 @@ def set_blend(polynomials, radii, crossings, d):
 
 @njit(cache=True, error_model="numpy")
 def clear_slopes(crossings, d, order):
-    """Take out of the blends what linear sets follow: slopes, and of one parameter and order 2 the curvature (B11)."""
+    """Remove from the blends what linear sets follow: slopes, and for one parameter and order 2 the curvature (B11)."""
     rows, room = crossings.rows, crossings.room
     for row in range(1, 1 + d + (1 if order == 2 else 0)):
         for channel in range(3):
@@ -168,7 +167,7 @@ def clear_slopes(crossings, d, order):
 
 @njit(cache=True, error_model="numpy")
 def restrict(columns, middle, half, crossings, d):
-    """The first ``columns`` forms over the part of the box about ``middle`` [d] of the half-widths ``half`` [d]."""
+    """Compute the first ``columns`` forms over the part of the box with ``middle`` [d] and half-widths ``half`` [d]."""
     rows, room = crossings.rows, crossings.room
     part = _restricted_rows(d)
     behind = part + d
@@ -213,9 +212,9 @@ def restrict(columns, middle, half, crossings, d):
 
 @njit(cache=True, error_model="numpy")
 def set_planes(columns, limit, crossings, d):
-    """Planes above and below what skipping takes of each fragment over a part, from what `restrict` left (B11).
+    """Compute planes above and below each fragment's change by skipping over a part, from `restrict` (B11).
 
-    A fragment surely is skipped below alpha ``limit``.
+    A fragment is surely skipped below alpha ``limit``.
     """
     rows, room = crossings.rows, crossings.room
     part = _restricted_rows(d)
@@ -251,16 +250,16 @@ def set_planes(columns, limit, crossings, d):
 
 @njit(cache=True, error_model="numpy", forceinline=True)
 def _weighted(weight, above, below, above_at_0, below_at_0, before):
-    """Slope of a weighted term by the plane that its sign asks for, and its value at 0 added to those ``before``."""
+    """Return the slope of a weighted term's plane, chosen by its sign, and ``before`` plus the plane's value at 0."""
     raised = weight > 0.0
     return weight * where(raised, above, below), fma(weight, where(raised, above_at_0, below_at_0), before)
 
 
 @njit(cache=True, error_model="numpy")
 def _by_planes(columns, side, place, bounds, crossings, d):
-    """Upper bounds over a part of ``side`` (1 or -1) times each channel, by planes chosen at ``place`` [d] of it.
+    """Compute upper bounds over a part of ``side`` (1 or -1) times each channel, by planes chosen at ``place`` [d].
 
-    ``bounds`` [4 + 4 d] receives those of three channels, and behind the slopes of each parameter.
+    ``bounds`` [4 + 4 d] receives those of three channels, then the slopes of each parameter.
     """
     rows, room = crossings.rows, crossings.room
     part = _restricted_rows(d)
@@ -320,7 +319,7 @@ def _by_planes(columns, side, place, bounds, crossings, d):
 
 @njit(cache=True, error_model="numpy")
 def bound_part(columns, side, place, bounds, crossings, d):
-    """`_by_planes` at the corner that the blends point to, or between where the planes point back; the better."""
+    """Do `_by_planes` at the corner that the blends point to, or where the planes point back; keep the tighter."""
     rows, room = crossings.rows, crossings.room
     part = _restricted_rows(d)
     for k in range(d):
@@ -341,7 +340,7 @@ def bound_part(columns, side, place, bounds, crossings, d):
 
 @njit(cache=True, error_model="numpy")
 def _choose_parts(columns, pieces, crossings, d):
-    """Write into how many ``pieces`` [d] each axis is cut: the one along which what is taken varies most, in turn."""
+    """Write the number of ``pieces`` [d] of each axis: the axis of most variation by skipping is cut, repeatedly."""
     rows, room = crossings.rows, crossings.room
     steepness = offset_by(pieces, d)
     for k in range(d):
@@ -374,7 +373,7 @@ def _place_part(number, pieces, middle, half, d):
 
 @njit(cache=True, error_model="numpy", forceinline=True)
 def _foremost(foretold, left):
-    """Of the parts ``left`` the one for which most is ``foretold`` [_PARTS, 8] of the channels, up or down."""
+    """Return the part among ``left`` with the largest estimate ``foretold`` [_PARTS, 8] of a channel, up or down."""
     best, most = lowest_bit(left), -float("inf")
     for number in range(_PARTS):
         if left & (1 << number) == 0:
@@ -390,16 +389,16 @@ def _foremost(foretold, left):
 
 @njit(cache=True, error_model="numpy", forceinline=True)
 def crossing_scratch(crossings, d):
-    """Scratch behind what `restrict` shares."""
+    """Return the scratch behind that of `restrict`."""
     return offset_by(crossings.rows, (_restricted_rows(d) + d + _SCRATCH) * crossings.room + CROSSING_LANES * d)
 
 
 @njit(cache=True, error_model="numpy", forceinline=True)
 def foretell(foretold, moved, crossings, d):
-    """Bound three channels over a part from what `restrict` left of them, wherever fragments are skipped.
+    """Bound three channels over a part from the forms of `restrict`, wherever fragments are skipped.
 
-    ``foretold`` [8] receives upper bounds of their negatives, then of themselves; ``moved`` [8] is by how much skipping
-    lowers them at most, then by how much it raises them.
+    ``foretold`` [8] receives upper bounds of their negatives, then of themselves; ``moved`` [8] is the largest fall of
+    the channels by skipping, then the largest rise.
     """
     rows, room, part = crossings.rows, crossings.room, _restricted_rows(d)
     for channel in range(3):
@@ -414,10 +413,10 @@ def foretell(foretold, moved, crossings, d):
 
 @njit(cache=True, error_model="numpy")
 def bound_by_parts(count, limit, crossings, out, d):
-    """Bounds of three channels, whose blends `set_blend` wrote, with ``count`` fragments that may be skipped (B11).
+    """Compute bounds of three channels from the blends of `set_blend`, with ``count`` skippable fragments (B11).
 
-    ``out`` [8] holds by how much skipping lowers the channels at most, then by how much it raises them; it receives
-    lower bounds, then upper ones, each of three channels and one of none. ``d`` is positive.
+    ``out`` [8] holds the largest fall of the channels by skipping, then the largest rise; it receives lower bounds,
+    then upper ones, each of three channels and padding. ``d`` is positive.
     """
     columns = crossing_columns(count)
     pieces = crossing_scratch(crossings, d)

@@ -1,4 +1,4 @@
-"""Scenes of which some Gaussians vary: their ranges, and the scene samples of the set (design.md, S1)."""
+"""Sets of scenes whose Gaussians vary: their ranges, and scene samples of the set (docs/dev/design.md, S1)."""
 
 from __future__ import annotations
 
@@ -20,12 +20,12 @@ _NONE = np.empty((0, 3))
 
 @dataclass(frozen=True)
 class VariedSplats:
-    """Every scene whose Gaussians lie in their own ranges, independently of each other.
+    """The set of all scenes whose Gaussians lie in their own ranges, independently of each other.
 
     Attributes:
         mean_low, mean_high: [N, 3] world, or [0, 3] where no mean varies.
         opacity_low, opacity_high: [N] in [0, 1].
-        shift_low, shift_high: [N, 3] what is added to the activated colours, or [0, 3].
+        shift_low, shift_high: [N, 3] shifts of the activated colours, or [0, 3].
     """
 
     stored: Splats
@@ -38,12 +38,12 @@ class VariedSplats:
 
     @classmethod
     def fixed(cls, splats: Splats) -> VariedSplats:
-        """The set that holds ``splats`` alone."""
+        """Return the set that contains ``splats`` alone."""
         return cls(splats, _NONE, _NONE, splats.opacity, splats.opacity, _NONE, _NONE)
 
     @cached_property
     def mean_middle(self) -> Float64Array:
-        """[N, 3] middles of the means' ranges; stored means where fixed."""
+        """Middles [N, 3] of the means' ranges; stored means where fixed."""
         if not self.mean_low.size:
             return self.stored.means
         middle = 0.5 * (self.mean_low + self.mean_high)
@@ -51,7 +51,7 @@ class VariedSplats:
 
     @cached_property
     def mean_radius(self) -> Float64Array:
-        """[N, 3] how far means may be from their middles, rounded up; or [0, 3]."""
+        """Largest distances [N, 3] of means from their middles, rounded up; or [0, 3]."""
         if not self.mean_low.size:
             return _NONE
         middle = self.mean_middle
@@ -59,7 +59,7 @@ class VariedSplats:
 
     @cached_property
     def counts(self) -> dict[str, int]:
-        """How many Gaussians vary in each quantity."""
+        """The number of Gaussians that vary in each quantity."""
         return {
             "mean": int((self.mean_low != self.mean_high).any(axis=1).sum()),
             "opacity": int((self.opacity_low != self.opacity_high).sum()),
@@ -68,13 +68,13 @@ class VariedSplats:
 
     @property
     def varies(self) -> bool:
-        """Whether there is more than one scene sample."""
+        """Whether the set has more than one scene."""
         return any(self.counts.values())
 
     def scene_sample(
         self, mean: Float64Array | float, opacity: Float64Array | float, color: Float64Array | float
     ) -> Splats:
-        """One scene of the set, at positions in [-1, 1] between the ranges' ends, broadcast to [N, 3], [N], [N, 3]."""
+        """Return one scene, at positions in [-1, 1] between the ranges' ends, broadcast to [N, 3], [N], [N, 3]."""
         return self.at(
             _between(self.mean_low, self.mean_high, mean) if self.mean_low.size else self.stored.means,
             _between(self.opacity_low, self.opacity_high, opacity),
@@ -82,7 +82,7 @@ class VariedSplats:
         )
 
     def at(self, means: Float64Array, opacity: Float64Array, shift: Float64Array) -> Splats:
-        """The scene with these values, clipped into the set: [N, 3], [N], [N, 3]."""
+        """Return the scene with these values, clipped into the set: [N, 3], [N], [N, 3]."""
         return replace(
             self.stored,
             means=np.clip(means, self.mean_low, self.mean_high) if self.mean_low.size else self.stored.means,
@@ -92,17 +92,15 @@ class VariedSplats:
 
     @cached_property
     def nearest(self) -> Splats:
-        """The scene sample nearest to the stored scene: itself where the ranges contain 0."""
+        """The scene of the set nearest to the stored one: itself where the ranges contain 0."""
         if not self.varies and not self.mean_low.size and not self.shift_low.size:
             return self.stored
         return self.at(self.stored.means, self.stored.opacity, np.zeros_like(self.shift_low))
 
     def scene_samples(self, generator: np.random.Generator) -> Iterator[Splats]:
-        """Members without end: first all at the ends that make pictures bright or dark or shift them, then random.
+        """Yield scenes of the set without end: first extremes that brighten, darken or shift pictures, then random.
 
-        See design.md, S5.
-
-        Where a Gaussian is brighter than most, more opacity tends to brighten the picture.
+        Where a Gaussian is brighter than most, more opacity tends to brighten the picture (design.md, S5).
         """
         stored = self.stored
         brightness = stored.sh[:, 0].sum(axis=1)
@@ -130,7 +128,7 @@ def _between(low: Float64Array, high: Float64Array, place: Float64Array | float)
 
 
 def base_colors(scene: SplatScene) -> Float64Array:
-    """[N, 3] activated colours of band 0, which the colour rule of a selection looks at."""
+    """Return activated colours [N, 3] of band 0, which the colour rule of a selection compares."""
     band = scene.sh[:, 0].astype(np.float64)
     if scene.color_model == "sigmoid":
         return 1.0 / (1.0 + np.exp(-band))
@@ -138,7 +136,7 @@ def base_colors(scene: SplatScene) -> Float64Array:
 
 
 def selected(scene: SplatScene, opacity: Float64Array, select: Selection) -> np.ndarray:
-    """[N] bool: the Gaussians that ``select`` picks; ``opacity`` [N] is the activated one.
+    """Return [N] bool the Gaussians that ``select`` picks; ``opacity`` [N] is the activated one.
 
     Raises:
         InputError: A number is beyond the last Gaussian of the source.
@@ -167,7 +165,7 @@ def selected(scene: SplatScene, opacity: Float64Array, select: Selection) -> np.
 
 
 def vary(scene: SplatScene, splats: Splats, variations: Sequence[SceneVariation]) -> VariedSplats:
-    """The set of scenes that ``variations`` describe; Gaussians picked twice get the smallest range that holds both.
+    """Return the set of scenes that ``variations`` describe; Gaussians picked twice get the hull of both ranges.
 
     Raises:
         InputError: An entry picks no Gaussian, or a number beyond the last one.

@@ -1,7 +1,7 @@
-"""Blending weights of chosen Gaussians: pictures in which these are white, the others black (design.md, Q1, Q2).
+"""Blending weights of selected Gaussians: pictures in which these are white, all others black (design.md, Q1, Q2).
 
-A pixel of gsplat is a sum of colours, each times its Gaussian's weight, so that a channel of such a picture is the sum
-of the weights of the white Gaussians. Nothing else of the program depends on colours.
+A pixel of gsplat is a sum of colours, each times its Gaussian's weight. So a channel of such a picture is the sum of
+the weights of the white Gaussians. Nothing else in the program depends on colours.
 """
 
 from __future__ import annotations
@@ -36,7 +36,7 @@ if TYPE_CHECKING:
 
 
 def plane_mask(scene: SplatScene, opacity: Float64Array, plane: WeightPlane) -> np.ndarray:
-    """[N] bool: the Gaussians that the plane's selection picks. Raises InputError where it picks none."""
+    """Return [N] bool the Gaussians that the plane's selection picks. Raises InputError where it picks none."""
     if plane.select is None:
         return np.ones(scene.count, bool)
     try:
@@ -50,11 +50,11 @@ def plane_mask(scene: SplatScene, opacity: Float64Array, plane: WeightPlane) -> 
 
 @dataclass(frozen=True)
 class WhiteGaussians:
-    """Which Gaussians are white in each channel: those that are selected and nearer than a distance.
+    """The Gaussians that are white in each channel: those that are selected and nearer than a distance.
 
     Attributes:
         selected: [N, 3] bool.
-        nearer: [3] depths of centres, normalised units; infinite where any depth will do.
+        nearer: [3] depths of centres, normalised units; infinite: no limit.
     """
 
     selected: np.ndarray
@@ -62,21 +62,21 @@ class WhiteGaussians:
 
     @classmethod
     def of(cls, masks: Sequence[np.ndarray], nearer: Sequence[float | None]) -> WhiteGaussians:
-        """One channel for each of at most three masks [N]; the other channels stay black."""
+        """Return one channel for each of at most three masks [N]; the other channels stay black."""
         black = [np.zeros_like(masks[0])] * (MOST_PLANES - len(masks))
         distances = [np.inf if distance is None else distance for distance in nearer]
         return cls(np.stack([*masks, *black], axis=1), np.array(distances + [np.inf] * len(black)))
 
     def at(self, depth: Float64Array) -> Float64Array:
-        """[N, 3] colours of Gaussians at ``depth`` [N]."""
+        """Return colours [N, 3] of Gaussians at ``depth`` [N]."""
         if np.isinf(self.nearer).all():
             return self.selected.astype(np.float64)
         return (self.selected & ((depth[:, None] < self.nearer) | np.isinf(self.nearer))).astype(np.float64)
 
     def between(self, numbers: np.ndarray, low: Float64Array, high: Float64Array) -> tuple[Float64Array, Float64Array]:
-        """[k, 3] lower and upper bounds of the colours of Gaussians ``numbers`` [k], whose depths lie in a range.
+        """Return bounds [k, 3] of the colours of Gaussians ``numbers`` [k] with depths in [low, high].
 
-        A depth that is no number may be any.
+        A depth of NaN may be any.
         """
         chosen = self.selected[numbers]
         anywhere = np.isinf(self.nearer)
@@ -92,7 +92,7 @@ class WeightBounds(SubBoxBounds):
     def _colors(
         self, forms: PoseForms, camera_magnitude: np.ndarray, candidates: np.ndarray, alive: np.ndarray, n: int
     ) -> np.ndarray:
-        """[n, 6] centres and radii by channel (design.md, Q2)."""
+        """Return [n, 6] centres and radii by channel (design.md, Q2)."""
         numbers = candidates[alive]
         if np.isinf(self.white.nearer).all():
             colors = np.zeros((n, 6))
@@ -106,7 +106,7 @@ class WeightBounds(SubBoxBounds):
     def _camera_depth_bounds(
         self, forms: PoseForms, camera_magnitude: np.ndarray, candidates: np.ndarray, alive: np.ndarray
     ) -> tuple[Float64Array, Float64Array]:
-        """[k] bounds of the depths of candidates ``alive`` over the cell, in every evaluation of the program."""
+        """Return bounds [k] of the depths of candidates ``alive`` over the cell, in every evaluation of the program."""
         m = forms.rotation.basis.monomials
         low, high = forms.rotation.bounds()
         most = np.maximum(np.abs(low), np.abs(high)).ravel()
@@ -124,8 +124,8 @@ class SplatWeightFrame(SplatFrame):
     """A frame of blending weights; see `ns_abstract.refine.protocol.WeightFrame`.
 
     Args:
-        white: Which Gaussians are white.
-        rasteriser, arithmetic, pose_set, varied, sums, reference: As `SplatFrame` takes them.
+        white: The white Gaussians.
+        rasteriser, arithmetic, pose_set, varied, sums, reference: As in `SplatFrame`.
     """
 
     def __init__(
@@ -152,7 +152,7 @@ class SplatWeightFrame(SplatFrame):
     def precise(
         self, values: np.ndarray, tiles: np.ndarray | None = None, scene_sample: Splats | None = None
     ) -> np.ndarray:
-        """What `drawn` rounds: float64 tiles of the weights at parameter values [d]."""
+        """Return float64 tiles of the weights at parameter values [d], before the rounding of `drawn`."""
         rotation, position = self.pose_set.world_to_camera(values)
         scene = self.varied.nearest if scene_sample is None else scene_sample
         colors = self.white.at((scene.means - position) @ rotation[2])

@@ -1,4 +1,4 @@
-"""Share a kernel's work among threads: each takes the next piece that none has taken yet."""
+"""Shares a kernel's work among threads: each takes the next piece that no other thread has taken."""
 
 from __future__ import annotations
 
@@ -14,12 +14,12 @@ CHUNK = 1024
 
 
 class ThreadShare(NamedTuple):
-    """One thread's part of a picture.
+    """One thread's share of a picture.
 
     Attributes:
         thread: Its number.
-        sequence: [t] numbers of all tiles, those with most to do first.
-        counter: [1] int64, how many are taken.
+        sequence: [t] numbers of all tiles, those with most work first.
+        counter: [1] int64, the number of tiles taken.
     """
 
     thread: int
@@ -36,8 +36,7 @@ def run_by_tiles(kernel: Callable[..., object], sequence: np.ndarray, count: int
 def run_in_chunks(kernel: Callable[..., object], count: int, *arguments: object) -> None:
     """Run ``kernel(counter, *arguments)`` in as many threads as there is work for.
 
-    The kernel takes chunks of `CHUNK` of the ``count`` Gaussians by the number that it takes from the counter, int64
-    [1].
+    The kernel takes chunks of `CHUNK` of the ``count`` Gaussians, numbered by the counter, int64 [1].
     """
     counter = np.zeros(1, np.int64)
     side_by_side(lambda _: kernel(counter, *arguments), max(1, min(threads(), -(-count // CHUNK))))

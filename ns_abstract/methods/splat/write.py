@@ -61,7 +61,7 @@ def write_splatfacto_run(
     views: Sequence[KeyframeCamera] | None = None,
     render: Callable[[KeyframeCamera], ArrayLike] | None = None,
 ) -> Path:
-    """Write ``scene`` as a Splatfacto run, and a small data set beside it; returns the path of config.yml.
+    """Write ``scene`` as a Splatfacto run, and a small data set beside it; return the path of config.yml.
 
     Files: ``FOLDER/EXPERIMENT/splatfacto/TIMESTAMP/{config.yml, dataparser_transforms.json,
     nerfstudio_models/step-000029999.ckpt}`` and ``FOLDER/data/{transforms.json, images/*.png}``. Every file is replaced
@@ -74,7 +74,7 @@ def write_splatfacto_run(
         timestamp: Name of the run, as in "2026-11-21_120000".
         experiment_name: Name of the folder of its experiment.
         views: Cameras of the data set, normalised frame, at least two of one size and field of view.
-        render: Gives the image [H, W, 3] in [0, 1] of a view; without it images hold only the background colour.
+        render: Returns the image [H, W, 3] in [0, 1] of a view; without it images hold only the background colour.
 
     Raises:
         InputError: ``timestamp`` or ``experiment_name`` is not a plain folder name.
@@ -144,11 +144,11 @@ def _scheduler_state(rate: float) -> dict[str, Any]:
 
 
 def write_ply(scene: SplatScene, file: Path) -> tuple[str, ...]:
-    """Write ``scene``; `ns_abstract.methods.splat.load.load_scene` reads the same numbers back.
+    """Write ``scene`` as a .ply; `ns_abstract.methods.splat.load.load_scene` reads the same numbers back.
 
-    A comment says how the scene is rasterised. The file holds what the standard has room for: means in the run's
-    normalised frame, logarithms of scales, logits of opacities, quaternions as stored, spherical harmonics channel by
-    channel. Returns what it has no room for, one sentence each. Raises OSError where the file cannot be written.
+    A comment says how the scene is rasterised. The file holds means in the run's normalised frame, logarithms of
+    scales, logits of opacities, quaternions as stored, and spherical harmonics channel by channel. Returns a sentence
+    on each thing that the format cannot hold. Raises OSError where the file cannot be written.
     """
     import plyfile
 
