@@ -75,14 +75,14 @@ class ParameterBox:
 
 
 def part_middles(counts: np.ndarray) -> Float64Array:
-    """[d, k] middles in [-1, 1] of equal parts, ``counts`` [d] along the axes, numbered like entries of an array."""
+    """[d, k] middles of the k equal parts of [-1, 1]^d, ``counts`` [d] along the axes, in row-major order."""
     along = [(2.0 * np.arange(n) + 1.0) / n - 1.0 for n in counts.tolist()]
     grid = np.array(np.meshgrid(*along, indexing="ij"), np.float64)
     return np.ascontiguousarray(grid.reshape(counts.size, counts.prod()))
 
 
 def shared_out(weights: np.ndarray, parts: int) -> np.ndarray:
-    """Numbers of parts [d] along axes, ``parts`` together (a power of two), more where ``weights`` [d] are larger."""
+    """Numbers of parts [d] along the axes whose product is ``parts`` (a power of two), more for larger ``weights``."""
     counts = np.ones(weights.size, np.int64)
     while counts.prod() < parts:
         counts[np.argmax(weights / counts)] *= 2

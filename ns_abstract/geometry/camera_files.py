@@ -18,19 +18,19 @@ from ns_abstract.io.jsonio import InputTuning, is_number, show, unusable
 #: OpenCV axes (x right, y down, z forward) as OpenGL axes (x right, y up, z back).
 _OPENGL = np.diag([1.0, -1.0, -1.0])
 _DISTORTION = ("k1", "k2", "k3", "k4", "p1", "p2")
-#: What Nerfstudio takes for applied_transform where a data set states none and has this folder beside it.
+#: Nerfstudio's applied_transform of a data set that states none and has this folder beside it.
 _COLMAP_FOLDER, _COLMAP_APPLIED = "colmap/sparse/0", [[0, 1, 0, 0], [1, 0, 0, 0], [0, 0, -1, 0]]
 _MODELS = ("OPENCV", "PINHOLE", "SIMPLE_PINHOLE", "PERSPECTIVE")
-#: Of a camera's position, in Nerfstudio.
+#: Number of float32 roundings of a camera's position in Nerfstudio.
 _FLOAT32_ROUNDINGS = 12
 _INTRINSICS = ("fl_x", "fl_y", "cx", "cy", "w", "h")
 
 
 @dataclass(frozen=True)
 class FileCamera:
-    """A camera as a file has it: ``camera_to_world`` 3x4 numbers, OpenGL axes, and intrinsics in pixels.
+    """A camera as read from a file: ``camera_to_world`` 3x4 numbers, OpenGL axes, and intrinsics in pixels.
 
-    Numbers are not checked but for being numbers, ``width`` and ``height`` not at all.
+    They are finite numbers; ``width`` and ``height`` of transforms.json are not checked. ``field``: for messages.
     """
 
     field: str
@@ -66,16 +66,13 @@ def transforms_cameras(
 ) -> Iterator[FileCamera]:
     """The cameras of a data set's ``transforms.json``, in the frame of a run that was trained on it.
 
-    As Nerfstudio reads them (nerfstudio_dataparser.py): what the file states for all frames comes before what a frame
-    states.
+    As in Nerfstudio (nerfstudio_dataparser.py), values at the top level come before those of a frame. Raises
+    InputError: there is no run, a camera is not a plain perspective one, or a field is missing.
 
     Args:
         root: The content of the file.
-        frame: The run's; None: the scene is no run.
-        folder: Where the file lies.
-
-    Raises:
-        InputError: There is no run, a camera is not a plain perspective one, or a field is missing.
+        frame: Transform from the data set's frame to the run's; None: the scene is no run.
+        folder: The file's folder.
     """
     if frame is None:
         problem = "is a data set's transforms.json, and the scene is no run whose frame could be told from it"
@@ -126,7 +123,7 @@ def transforms_cameras(
 
 
 def _refuse_far(frame: DataparserTransform, pose: NDArray[np.float64], field: str) -> None:
-    """Refuse a ``pose`` [4, 4] that lies so far from the run's origin that Nerfstudio's float32 moves the camera."""
+    """Raise InputError for a ``pose`` [4, 4] so far from the run's origin that Nerfstudio's float32 moves it."""
     reach = frame.scale * float((np.abs(frame.matrix) @ np.abs(pose[:, 3])).max())
     # a rounding of the pose, of each product and sum, of the scale, and as many of a transform that holds another
     moved = _FLOAT32_ROUNDINGS * UNIT32 * reach
@@ -136,7 +133,7 @@ def _refuse_far(frame: DataparserTransform, pose: NDArray[np.float64], field: st
 
 
 def _refuse_distorted(section: Mapping[str, Any], prefix: str) -> None:
-    """Refuse what the whole file or one frame states of other lenses; one of them must not hide the other."""
+    """Raise InputError if ``section``, the file's top level or a frame, states a distorted or another lens."""
     model = section.get("camera_model", "PERSPECTIVE")
     if model not in _MODELS:
         problem = f"found {show(model)}: only perspective cameras are bounded"

@@ -1,4 +1,4 @@
-"""Camera paths as Nerfstudio's viewer writes them."""
+"""Pinhole cameras, and camera paths as Nerfstudio's viewer writes them."""
 
 from __future__ import annotations
 
@@ -114,7 +114,7 @@ class CameraPath:
         fps: Frames per second, or None if the file does not say.
         is_cycle: Whether the path closes.
         source: The file.
-        notes: What of the file is not used because nothing is known of it, one sentence each.
+        notes: Sentences on unknown keys and on cameras that ns-render draws otherwise.
     """
 
     cameras: tuple[PinholeCamera, ...]
@@ -131,7 +131,7 @@ class CameraPath:
         return self.perturbation if own is None else own
 
     def _place(self, index: int) -> int:
-        """``index`` from 0; negative ones count from the end, as of lists."""
+        """``index`` as a number from 0; a negative one counts from the end. Raises InputError: out of range."""
         count = len(self.cameras)
         number = whole(index, -count, "index", count - 1)
         return number + count if number < 0 else number
@@ -177,7 +177,7 @@ def load_camera_path(
 
 
 def _photo_path(file_cameras: Iterable[FileCamera], source: str, downscale_factor: float) -> CameraPath:
-    """The path of the cameras of photos."""
+    """Path of the cameras of photos, without perturbations; ``source``: the file. Raises InputError."""
     cameras = []
     for entry in file_cameras:
         camera = PinholeCamera(
@@ -201,7 +201,7 @@ def focal_pixels(value: Any, field: str) -> float:
 
 
 def principal_place(value: Any, side: int, field: str) -> float:
-    """A coordinate of the principal point, pixels; without it the middle of a side."""
+    """``value`` as a coordinate of the principal point, pixels; half of ``side`` if it is None. Raises InputError."""
     if value is not None and not is_moderate(value):
         raise unusable(value, field=field, fix="write a number of pixels")
     return side / 2 if value is None else float(value)
@@ -212,13 +212,12 @@ def stated_intrinsics(
 ) -> Intrinsics:
     """Intrinsics in pixels as a file or a caller states them.
 
+    Raises InputError: one of them is no moderate number, or a focal length is not above 0.
+
     Args:
-        own: ``fx``, ``fy``, ``cx``, ``cy``; what is None or missing follows from ``focal`` and from the middle.
+        own: ``fx``, ``fy``, ``cx``, ``cy``. None or missing: ``focal()`` for fx, fx for fy, the middle for cx and cy.
         focal: The focal length where ``fx`` is not stated.
         height, width: Size of the pictures, pixels.
-
-    Raises:
-        InputError: One of them is no moderate number, or a focal length is not above 0.
     """
     fx, fy = own.get("fx"), own.get("fy")
     across = focal() if fx is None else focal_pixels(fx, f"{prefix}fx")
@@ -267,7 +266,7 @@ def _parse(root: dict[str, Any], source: str, downscale_factor: float) -> Camera
 
 
 def _lens_of_fov(entry: Mapping[str, Any], lens: Intrinsics) -> Intrinsics:
-    """What ns-render takes for ``lens``: it reads ``fov`` alone, and stops at an entry without it."""
+    """Intrinsics with which ns-render draws an ``entry``, from ``fov`` alone; ``lens`` without a usable one."""
     fov = entry.get("fov")
     if not is_number(fov) or not 0 < fov < 180:
         return lens
@@ -276,14 +275,14 @@ def _lens_of_fov(entry: Mapping[str, Any], lens: Intrinsics) -> Intrinsics:
 
 
 def _other_lenses(fields: Sequence[str]) -> tuple[str, ...]:
-    """A note on the entries ``fields``, which ns-render draws by another camera; none without them."""
+    """Note that ns-render draws the entries ``fields`` with other intrinsics; no note without entries."""
     if not fields:
         return ()
     count = f" and {len(fields) - 1} more" if len(fields) > 1 else ""
     return (f"{fields[0]}{count}: fx, fy, cx and cy are taken; ns-render takes fov and the middle, another picture",)
 
 
-#: Files of Nerfstudio and of this program that are taken for camera paths, by a key that these lack.
+#: Other kinds of files of Nerfstudio and of this program, by a key that camera paths lack: kind and advice.
 _OTHERS: dict[str, tuple[str, str]] = {
     "transform": ("a run's dataparser_transforms.json, not a camera path", _FIX_FILE),
     "dynamics": ("a loop, not a camera path", "give it to ns-abstract-reach as --loop"),
@@ -295,7 +294,7 @@ _OTHERS: dict[str, tuple[str, str]] = {
 
 
 def _refuse_others(root: Any) -> None:
-    """Raise InputError for other kinds of files, naming the kind."""
+    """Raise InputError that names the kind of a parsed file which is no camera path."""
     if isinstance(root, list) and root and all(isinstance(e, dict) and "transform" in e for e in root):
         raise InputError("poses of photos as ns-export cameras writes them, not a camera path", fix=_FIX_FILE)
     if not isinstance(root, dict):
@@ -307,9 +306,9 @@ def _refuse_others(root: Any) -> None:
 
 
 def _entries(root: dict[str, Any], unknown: list[str]) -> list[tuple[str, dict[str, Any]]]:
-    """The cameras of a path with the names of their fields; names of unknown keys are added to ``unknown``.
+    """Field names and entries of a path's cameras; appends names of unknown keys to ``unknown``. Raises InputError.
 
-    The viewer interpolates between keyframes, and writes no camera where there is but one of them: it is the camera.
+    If "camera_path" is empty and there is one keyframe, this is the camera: the viewer writes none then.
     """
     fields_by_name: dict[str, list[tuple[str, dict[str, Any]]]] = {}
     for name, table in (("camera_path", ENTRY), ("keyframes", KEYFRAME)):
@@ -387,8 +386,7 @@ def _focal(entry: dict[str, Any], root: dict[str, Any], field: str, height: int)
 def focal_length(fov: Any, height: int, field: str) -> float:
     """Focal length in pixels of a vertical field of view in degrees, from the field ``field``.
 
-    Raises:
-        InputError: It is no angle above 0 and below 180 degrees with a float32 focal length.
+    Raises InputError: it is no angle above 0 and below 180 degrees with a float32 focal length.
     """
     if not is_number(fov) or not 0 < fov < 180:
         raise unusable(fov, field=field, fix="write degrees above 0 and below 180")
@@ -405,8 +403,7 @@ def focal_length(fov: Any, height: int, field: str) -> float:
 def checked_pose(value: Any, field: str) -> NDArray[np.float64]:
     """A camera-to-world pose [3, 4] float64 from 16 numbers in rows, flat or nested, from the field ``field``.
 
-    Raises:
-        InputError: It is no rigid, right-handed pose of numbers that float32 can hold.
+    Raises InputError: it is no rigid, right-handed pose of numbers that float32 can hold.
     """
     if isinstance(value, list) and len(value) == 4 and all(isinstance(row, list) for row in value):
         for i, row in enumerate(value):

@@ -13,7 +13,7 @@ from ns_abstract.geometry.poses import PoseBox
 
 
 class _Tensors:
-    """Tensors at parameter ``values`` [d], as an arithmetic of `PoseBox.evaluated`."""
+    """Arithmetic for `PoseBox.evaluated` whose numbers are tensors at the parameter ``values`` [d]."""
 
     def __init__(self, values: Tensor, dimensions: int) -> None:
         if values.shape != (dimensions,):
@@ -28,7 +28,7 @@ class _Tensors:
 
 
 def differentiable_pose(pose_set: PoseBox) -> Callable[[Tensor], Tensor]:
-    """The function from parameter values [d] to camera-to-world [3, 4], both float64, as `PoseBox.pose` has them."""
+    """Differentiable version of `PoseBox.pose`: from parameter values [d] to camera-to-world [3, 4], float64."""
 
     def pose(values: Tensor) -> Tensor:
         tensors = _Tensors(values, pose_set.box.dimensions)

@@ -1,4 +1,4 @@
-"""Boxes around cells that depend on the cell and its set alone, so that what is known of them serves many cells."""
+"""Boxes around cells on a dyadic grid of the set, so that values computed once for a box serve all cells in it (Q5)."""
 
 from __future__ import annotations
 
@@ -18,16 +18,16 @@ from ns_abstract.geometry.box import ParameterBox
 class EnclosingTuning:
     """How much wider enclosing boxes are. None of it decides whether a bound holds."""
 
-    #: An enclosing box is at least this power of two wider than the cell, along every parameter.
+    #: Exponent of the least factor (a power of two) by which an enclosing box is wider than the cell, by parameter.
     halvings: int = 1
-    #: Most pixels that the picture moves by over an enclosing box; bounds of wider ones say too little.
+    #: Most pixels by which the picture moves over an enclosing box; bounds over wider ones are too loose.
     motion: float = 8.0
-    #: Halvings of the set that cells are told apart by, and parts of a box that ends of cells may miss a line of the
-    #: grid by, as they are rounded; and parts of a box that it reaches beyond its lines, so that these ends lie inside.
+    #: By how much a cell's end may miss a line of the grid through rounding, as a share of a grid interval; and by how
+    #: much a box reaches beyond its lines, likewise, so that such ends lie inside.
     spare: float = 1e-6
     beyond: float = 1e-9
-    #: Pixels that the picture moves by along each parameter over the boxes of `EnclosingBoxes`, about, where a cell is
-    #: no wider; and most bytes that is kept of them.
+    #: About how many pixels the picture moves by along each parameter over a box of `EnclosingBoxes`, unless a cell is
+    #: wider; and most bytes of the values that are kept for them.
     shared_motion: float = 2.0
     most: int = 1 << 27
     #: Most halvings of other parameters before a parameter is halved over which the picture hardly moves.
@@ -38,20 +38,20 @@ _TUNING = EnclosingTuning()
 
 
 def enclosing_box(cell: ParameterBox, whole: ParameterBox, motion: np.ndarray) -> ParameterBox | None:
-    """Return a box of ``whole`` around a cell of it, about two to eight times wider along each parameter.
+    """Box around a cell, inside the set ``whole``, about two to eight times wider along each parameter (Q5).
 
-    Its ends lie on a dyadic grid of ``whole``, so that neighbouring cells of about the same widths share it (Q5). None:
-    the picture, which moves by ``motion`` [d] pixels over each parameter's range, would move by too much.
+    Its ends lie on a dyadic grid of ``whole``, so that neighbouring cells of similar widths share it. ``motion`` [d]
+    are pixels by which the picture moves over each range of ``whole``. None: it would move too much over the box.
     """
     levels = [max(0, level - _TUNING.halvings) for level in _levels(cell, whole)]
     return _useful(_aligned(cell, whole, levels), cell, whole, motion)
 
 
 def shared_box(box: ParameterBox, whole: ParameterBox, motion: np.ndarray) -> ParameterBox | None:
-    """Return a wider box of ``whole`` around an enclosing one, over which the picture moves about alike by parameter.
+    """Wider box around an enclosing ``box``, over which the picture moves about equally along each parameter (Q5).
 
-    Enclosing boxes are as long and narrow as cells are; few of those around them serve all (Q5). None: it would be too
-    wide to be of use, by ``motion`` as in `enclosing_box`, or is no wider.
+    Enclosing boxes are as long and narrow as cells; a few shared boxes hold all of them. ``whole``, ``motion``: see
+    `enclosing_box`. None: the picture would move too much, or the box is no wider.
     """
     most = float(np.max(motion, initial=0.0))
     if not math.isfinite(most):
@@ -70,9 +70,9 @@ def shared_box(box: ParameterBox, whole: ParameterBox, motion: np.ndarray) -> Pa
 
 
 def box_of_motion(cell: ParameterBox, whole: ParameterBox, motion: np.ndarray, pixels: float) -> ParameterBox | None:
-    """Return a box of ``whole`` around a cell of it over which the picture moves by about ``pixels`` along a parameter.
+    """Box around a cell, inside ``whole``, over which the picture moves by about ``pixels`` along each parameter.
 
-    It is wider than the cell as `enclosing_box` is, and ``motion`` as there. None: the cell reaches beyond ``whole``.
+    It is at least as much wider than the cell as `enclosing_box` (``motion``: see there). None: it leaves ``whole``.
     """
     if not (whole.contains(np.array(cell.lower)) and whole.contains(np.array(cell.upper))):
         return None
@@ -82,7 +82,7 @@ def box_of_motion(cell: ParameterBox, whole: ParameterBox, motion: np.ndarray, p
 
 
 class InMemory(Protocol):
-    """What takes memory."""
+    """A value whose size in memory is known."""
 
     @property
     def nbytes(self) -> int: ...
@@ -92,26 +92,23 @@ _Value = TypeVar("_Value", bound=InMemory)
 
 
 class EnclosingBoxes(Generic[_Value]):
-    """What is known of boxes around cells, by which a set is divided evenly; the latest are kept.
+    """Cache of values that are computed for boxes around cells (`box_of_motion`); threads may share it.
 
     Args:
-        whole: The set.
-        motion: Tells by how many pixels [d] the picture moves over a box.
-        find: Finds what is to be known of a box.
+        whole: The parameter box of the pose set.
+        motion: Returns pixels [d] by which the picture moves over each parameter's range of a box.
+        find: Computes the value of a box.
     """
 
     def __init__(
-        self,
-        whole: ParameterBox,
-        motion: Callable[[ParameterBox], np.ndarray],
-        find: Callable[[ParameterBox], _Value],
+        self, whole: ParameterBox, motion: Callable[[ParameterBox], np.ndarray], find: Callable[[ParameterBox], _Value]
     ) -> None:
         self._whole, self._find_motion, self._find = whole, motion, find
         self._kept: dict[ParameterBox, _Value] = {}
         self._lock = threading.Lock()
 
     def around(self, cell: ParameterBox) -> _Value | None:
-        """What is known of a box around a cell; None: the cell reaches beyond the set."""
+        """Value of the box around a cell; None: the cell reaches beyond the set."""
         box = box_of_motion(cell, self._whole, self._motion, _TUNING.shared_motion)
         if box is None:
             return None
@@ -130,7 +127,7 @@ class EnclosingBoxes(Generic[_Value]):
 
 
 def _levels(cell: ParameterBox, whole: ParameterBox) -> list[int]:
-    """[d] halvings of ``whole`` along each parameter that leave it as wide as the cell or less than twice as wide."""
+    """[d] most halvings of ``whole`` along each parameter that leave it at least as wide as the cell."""
     widths = zip(cell.lower, cell.upper, whole.lower, whole.upper, strict=True)
     return [
         max(0, math.floor(math.log2((high - low) / (past - first)) + _TUNING.spare)) if past > first else 0
@@ -139,7 +136,7 @@ def _levels(cell: ParameterBox, whole: ParameterBox) -> list[int]:
 
 
 def _aligned(cell: ParameterBox, whole: ParameterBox, levels: Sequence[int]) -> ParameterBox:
-    """The smallest box around the cell whose ends lie on lines of ``whole`` halved ``levels`` [d] times, or just by."""
+    """Smallest box around the cell with ends on (or just beyond) lines of ``whole`` halved ``levels`` [d] times."""
     box = cell
     for axis, level in enumerate(levels):
         low, high = whole.lower[axis], whole.upper[axis]
@@ -155,7 +152,7 @@ def _aligned(cell: ParameterBox, whole: ParameterBox, levels: Sequence[int]) -> 
 
 
 def _useful(box: ParameterBox, cell: ParameterBox, whole: ParameterBox, motion: np.ndarray) -> ParameterBox | None:
-    """``box`` if it is wider than the cell and the picture moves by little over it."""
+    """``box`` if it is not the cell and the picture moves by at most `EnclosingTuning.motion` over it, else None."""
     widths = zip(box.lower, box.upper, whole.lower, whole.upper, motion.tolist(), strict=True)
     moved = [
         pixels * (past - first) / (high - low) if high > low else pixels for first, past, low, high, pixels in widths

@@ -92,6 +92,6 @@ def path_json(
 
 
 def ring(target: ArrayLike, distance: float, count: int = 10, size: int = 200) -> list[KeyframeCamera]:
-    """Views of ``target`` from all around it, by turns 15 and 30 degrees above."""
+    """``count`` views of ``target`` on a circle around it, alternately 15 and 30 degrees above."""
     turns = [360.0 * k / count for k in range(count)]
     return [around(target, a, 15.0 + 15.0 * (k % 2), distance, height=size, width=size) for k, a in enumerate(turns)]

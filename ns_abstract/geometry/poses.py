@@ -28,7 +28,7 @@ from ns_abstract.perturbation.specification import ROTATIONS, TRANSLATIONS, Pert
 _CAMERA_AXES = {"yaw": (0.0, 1.0, 0.0), "pitch": (1.0, 0.0, 0.0), "roll": (0.0, 0.0, 1.0)}
 #: Parameters that shift the colours of a NeRF's points and leave the pose alone.
 COLOR_SHIFTS = ("hue", "saturation")
-#: Where the scene as a whole stands: shifts along the world axes, or turns (radians) about those through the origin.
+#: Parameters of a rigid motion of the whole scene: shifts along the world axes, or turns (radians) about them.
 SCENE_SHIFTS = ("scene_x", "scene_y", "scene_z")
 SCENE_TURNS = ("scene_turn_x", "scene_turn_y", "scene_turn_z")
 #: OpenGL to OpenCV camera axes.
@@ -47,10 +47,9 @@ def rotation_about(axis: Float64Array, angle: float) -> Float64Array:
 
 
 def _check_segment(camera: PinholeCamera, following: PinholeCamera) -> None:
-    """Refuse keyframes whose own pictures would not be among those of the segment between them.
+    """Raise InputError unless the segment between two keyframes begins and ends with their own pictures.
 
-    Raises:
-        InputError: Their intrinsics differ, or the nearest rotation would replace what one of them has.
+    Their intrinsics must be equal, and their rotations orthonormal, since the segment uses the nearest rotations.
     """
     if following.intrinsics != camera.intrinsics:
         raise InputError(
@@ -131,10 +130,11 @@ class PoseBox:
     Attributes:
         camera: Intrinsics and image size; the pose of the first keyframe.
         box: Parameters of positive width, in the order x, y, z, yaw, pitch, roll, segment, azimuth, hue, saturation;
-            behind them where the scene stands (`registered`).
-        target_camera: End of the segment, where the sweep is over segments.
-        shear: [name][other] factors: ``box`` counts the rotation ``name`` from the sum of factor * other, so that its
-            cells are slanted (`sheared`).
+            then those of a motion of the scene (`registered`).
+        fixed: Values of the parameters of width 0.
+        target_camera: End of the segment, if the sweep is over segments.
+        shear: [name][other] factors: the rotation ``name`` is the box's value plus the sum of factor * other
+            (`sheared`).
     """
 
     camera: PinholeCamera
@@ -148,7 +148,7 @@ class PoseBox:
     def around(
         cls, camera: PinholeCamera, perturbation: Perturbation, following: PinholeCamera | None = None
     ) -> PoseBox:
-        """The set of one keyframe; ``following`` is the next one, used where the sweep is over segments."""
+        """The pose set of one keyframe; ``following`` is the next one, used if the sweep is over segments."""
         ranges: dict[str, tuple[str, tuple[float, float]]] = {}
         for name in TRANSLATIONS:
             ranges[name] = ("normalised units", perturbation.translation.get(name, (0.0, 0.0)))
@@ -180,11 +180,11 @@ class PoseBox:
         return replace(self, box=self.box.without(COLOR_SHIFTS))
 
     def registered(self, names: tuple[str, ...], radius: float) -> PoseBox:
-        """The same poses as seen from a scene that stands elsewhere as a whole (design.md, P3).
+        """The same pose set relative to a scene that is shifted or turned as a whole (design.md, P3).
 
         ``names``: `SCENE_SHIFTS`, normalised units; or `SCENE_TURNS`, radians: the scene is turned about the world axes
-        through the origin, z first and x last. These parameters stand behind the set's own, each from the negative of
-        ``radius`` to it; above 0.
+        through the origin, z first and x last. These parameters follow the set's own, each from -``radius`` to
+        ``radius``, which is above 0.
         """
         box, unit = self.box, "normalised units" if names == SCENE_SHIFTS else "rad"
         count = len(names)
@@ -193,10 +193,10 @@ class PoseBox:
         return replace(self, box=ParameterBox(*(a + b for a, b in zip(parts, more, strict=True))))  # pyright: ignore[reportArgumentType]
 
     def sheared(self, shear: dict[str, dict[str, float]]) -> PoseBox:
-        """The same poses in slanted parameters: rotation = own + sum of factor * other (design.md, P2).
+        """The same pose set in sheared parameters: rotation = parameter + sum of factor * other (design.md, P2).
 
-        The box holds every pose of the set and, near its ends, parameters of none: see `feasible`; `pose` takes them to
-        the nearest angle of the set.
+        The box holds parameters of every pose of the set and, near its ends, of none (`feasible`); for the latter,
+        `pose` takes the nearest angle of the set.
         """
         box = self.box
         for name, factors in shear.items():
@@ -211,7 +211,7 @@ class PoseBox:
         return replace(self, box=box, shear=shear)
 
     def within(self, box: ParameterBox) -> PoseBox:
-        """The poses of a box of the same parameters, as a set of their own (design.md, V15); not of slanted ones."""
+        """Pose set of a ``box`` of the same parameters (design.md, V15); not for sheared parameters."""
         ranges = dict(self.perturbation.rotation)
         for name, low, high in zip(box.names, box.lower, box.upper, strict=True):
             if name in ROTATIONS:
@@ -219,10 +219,7 @@ class PoseBox:
         return replace(self, box=box, perturbation=replace(self.perturbation, rotation=ranges))
 
     def feasible(self, box: ParameterBox) -> ParameterBox | None:
-        """A box that holds all parameters of ``box`` that belong to poses of the set; None where there are none.
-
-        See design.md, P2.
-        """
+        """Smaller box that holds all parameters of ``box`` of poses of the set; None: there are none (P2)."""
         for name, factors in self.shear.items():
             low, high = self.perturbation.rotation[name]
             terms = {box.names.index(name): 1.0} | {box.names.index(other): f for other, f in factors.items()}
@@ -232,7 +229,7 @@ class PoseBox:
             if least > high + room or most < low - room:
                 return None
             for i, factor in terms.items():
-                # what the other terms leave of [low, high]
+                # bounds of this term, from [low, high] minus the other terms
                 bottom, top = low - room - (most - ends[i][1]), high + room - (least - ends[i][0])
                 first, last = sorted((bottom / factor, top / factor))
                 first, last = first - room / abs(factor), last + room / abs(factor)
@@ -256,7 +253,7 @@ class PoseBox:
     def pose(self, values: Float64Array, beyond: bool = False) -> Float64Array:
         """Camera-to-world [3, 4] at parameter values [d] (physical units, in the order of ``box``).
 
-        Those of no pose of the set give the nearest one (`sheared`), or what lies ``beyond`` the set.
+        Sheared rotations outside of the set are clipped to it, unless ``beyond`` is true.
         """
         p = dict(self.fixed) | dict(zip(self.box.names, np.asarray(values, np.float64).tolist(), strict=True))
         for name, factors in self.shear.items():
@@ -276,7 +273,7 @@ class PoseBox:
         for name in ROTATIONS:
             if p[name] != 0.0:
                 rotation = rotation @ rotation_about(np.array(_CAMERA_AXES[name]), p[name])
-        # a scene elsewhere is a camera elsewhere
+        # a motion of the scene is the inverse motion of the camera
         for k, name in enumerate(SCENE_TURNS):
             if name in p:
                 turn = rotation_about(np.eye(3)[k], -p[name])
@@ -309,7 +306,7 @@ class PoseBox:
         start, displacement = self._base[1], self._base[4]
         limits = {name: (value, value) for name, value in self.fixed.items()}
         limits |= dict(zip(self.box.names, zip(self.box.lower, self.box.upper, strict=True), strict=True))
-        # of the box: a set that was grown reaches farther than it was stated
+        # limits of the box, because a set that was grown exceeds its perturbation's ranges
         farthest = sum(max(map(abs, limits[name])) for name in (*TRANSLATIONS, *SCENE_SHIFTS) if name in limits)
         shift = POSE_ROUNDING * (1.0 + farthest + np.abs(start).max() + np.abs(displacement).max())
         if self.perturbation.orbit is not None:
@@ -326,9 +323,10 @@ class PoseBox:
         trigonometry: Callable[[Any], tuple],
         array: Callable[[Float64Array], Any] = lambda numbers: numbers,
     ) -> tuple[Any, Any]:
-        """Camera-to-world rotation and position over ``box`` in the arithmetic ``kind``, without rounding of `pose`.
+        """Camera-to-world rotation [3, 3] and position [3] over ``box`` in an arithmetic ``kind`` (forms, tensors).
 
-        ``array``: makes what the arithmetic combines with of plain numbers.
+        The rounding errors of `pose` are not charged. ``kind`` has ``constant`` and ``parameter`` with the ``basis``;
+        ``trigonometry`` returns cosine and sine; ``array`` converts plain numbers for operations with ``kind``.
         """
 
         def parameter(name: str) -> Any:
@@ -389,6 +387,6 @@ class PoseBox:
 
 
 def translation_only(forms: PoseForms) -> bool:
-    """Return whether the depth direction is the same for every pose, up to rounding, so that no depth order changes."""
+    """Whether the camera's viewing direction is the same for every pose, up to rounding: the depth order is fixed."""
     row = forms.rotation[2]
     return bool(np.all(row.linear == 0.0) and np.all(row.radius < STILL_ROOM))

@@ -8,7 +8,7 @@ from ns_abstract.geometry.camera_path import PinholeCamera
 
 
 def tile_grid(camera: PinholeCamera, side: int) -> tuple[int, int]:
-    """Tiles across and down."""
+    """Numbers of tiles across and down of a camera's picture, for tiles of ``side`` pixels."""
     return -(-camera.width // side), -(-camera.height // side)
 
 
@@ -25,12 +25,12 @@ def assemble(tiles: np.ndarray, camera: PinholeCamera) -> np.ndarray:
     """A new image [H, W, ...] from all its tiles [T, side, side, ...] in row-major order."""
     across, _ = tile_grid(camera, tiles.shape[1])
     image = np.ascontiguousarray(laid_out(tiles, across)[: camera.height, : camera.width])
-    # tiles that are one below the other are laid out already: their memory is not the image's
+    # one column of tiles is a view of their memory
     return image.copy() if np.may_share_memory(image, tiles) else image
 
 
 def laid_out(tiles: np.ndarray, across: int) -> np.ndarray:
-    """All pixels [rows, columns, ...] of all tiles [T, side, side, ...], of which so many are in a row."""
+    """All pixels [rows, columns, ...] of row-major tiles [T, side, side, ...], ``across`` tiles in a row."""
     side, rest = tiles.shape[1], tiles.shape[3:]
     down = len(tiles) // across
     grid = tiles.reshape(down, across, side, side, *rest).swapaxes(1, 2)

@@ -1,4 +1,4 @@
-"""The frame of a run against that of its data set."""
+"""The transform from a data set's frame to the normalised frame of a run."""
 
 from __future__ import annotations
 
@@ -15,9 +15,9 @@ class DataparserTransform:
     """Maps the units of transforms.json to the normalised frame of the run.
 
     ``x_normalised = scale * (matrix[:, :3] @ x_dataset + matrix[:, 3])``
-    (nerfstudio/data/dataparsers/base_dataparser.py, ``DataparserOutputs``). ``stated``: whether the scene says so; the
-    identity stands for what it does not say. ``original``: whether the data set is COLMAP's own, from which a
-    transforms.json differs by what it says was applied.
+    (nerfstudio/data/dataparsers/base_dataparser.py, ``DataparserOutputs``). ``stated``: whether the scene states it; if
+    not, it is the identity. ``original``: whether the data set is COLMAP's own, from which a transforms.json differs by
+    its applied_transform.
     """
 
     matrix: NDArray[np.float64] = field(default_factory=lambda: np.eye(3, 4))  # [3, 4]
@@ -27,10 +27,7 @@ class DataparserTransform:
 
     @property
     def stated_scale(self) -> float | None:
-        """Normalised units per unit of the data set; None: the scene does not say, or they differ by direction.
-
-        What was applied to the data set's poses before may have scaled them: that scale is one of the matrix.
-        """
+        """Normalised units per unit of the data set, with a scale of the matrix; None: not stated, or no one scale."""
         rotation = self.matrix[:, :3]
         with np.errstate(over="ignore", invalid="ignore"):
             square = float((rotation**2).sum()) / 3.0

@@ -1,4 +1,4 @@
-"""Checks of arguments and options: numbers in their ranges, and paths; errors name the field and the fix."""
+"""Checks of arguments and options: numbers in their ranges, and paths; an InputError names ``field`` and the fix."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ if TYPE_CHECKING:
     import numpy as np
     from numpy.typing import DTypeLike
 
-#: Lists and mappings inside one another in what `plain` takes, and processes.
+#: Most nested lists and mappings in a value for `plain`, and most processes.
 _DEEPEST = 64
 _MOST_WORKERS = 1 << 16
 
@@ -35,8 +35,7 @@ def float64_of(value: Any) -> float:
 def positive(value: Any, field: str) -> float:
     """``value`` as a number above 0 and below infinity, from the argument or option ``field``.
 
-    Raises:
-        InputError: It is none.
+    Raises InputError: it is none.
     """
     number = float64_of(value)
     if not 0.0 < number < math.inf:
@@ -64,8 +63,7 @@ def whole(value: Any, least: int, field: str, most: int | None = None) -> int:
 def flag(value: Any, field: str) -> bool:
     """``value`` as a bool, from the argument ``field``.
 
-    Raises:
-        InputError: It is none; texts such as "no" would count as true.
+    Raises InputError: it is none; texts such as "no" would count as true.
     """
     if isinstance(value, bool):
         return value
@@ -77,7 +75,7 @@ def flag(value: Any, field: str) -> bool:
 
 
 def array_of(value: Any, dtype: DTypeLike | None = None) -> np.ndarray | None:
-    """``value`` as an array; None where it is none, such as a tensor that requires gradients."""
+    """``value`` as a NumPy array; None if it cannot be converted, such as a tensor that requires gradients."""
     import numpy as np
 
     try:
@@ -122,7 +120,7 @@ def plain(value: Any, depth: int = 0) -> Any:
 
 
 def file_path(value: Any, field: str) -> Path:
-    """``value`` as a path. Raises InputError where it can name no file; what is absent is found when it is read."""
+    """``value`` as a path. Raises InputError where it can name no file; the file may be absent."""
     if not isinstance(value, str | os.PathLike):
         raise unusable(value, field=field, fix="give the path of a file")
     try:

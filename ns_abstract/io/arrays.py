@@ -1,4 +1,4 @@
-"""Numpy archives (.npz) that others may have written: what they declare is checked before it is read."""
+"""Untrusted NumPy archives (.npz): shapes and types are checked before any array is read."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ _METHODS = (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED)
 
 
 class Archive:
-    """An open .npz; ``declared``: shape and type of every array, as its header says; nothing is unpacked for it."""
+    """An open .npz; ``declared``: shape and dtype of every array by name, from the headers alone."""
 
     def __init__(self, archive: zipfile.ZipFile) -> None:
         self._archive = archive
@@ -38,7 +38,7 @@ class Archive:
             self.declared[name] = self._header(member)
 
     def _header(self, member: zipfile.ZipInfo) -> tuple[tuple[int, ...], np.dtype]:
-        """Shape and type of a member whose data have exactly the size that they ask for."""
+        """Shape and dtype of an array of the archive. Raises InputError if its data have another size."""
         with self._archive.open(member) as stream:
             version = np.lib.format.read_magic(stream)
             if version not in ((1, 0), (2, 0)):
@@ -54,17 +54,16 @@ class Archive:
         return shape, kind
 
     def read(self, name: str) -> np.ndarray:
-        """An array; look at ``declared`` before."""
+        """The array ``name``; check its size in ``declared`` first."""
         with self._archive.open(f"{name}.npy") as stream:
             return np.lib.format.read_array(stream, allow_pickle=False, max_header_size=_HEADER_LIMIT)
 
 
 @contextmanager
 def open_archive(path: Path, what: str, fix: str) -> Iterator[Archive]:
-    """Open an .npz; whatever is wrong with it, also inside the block, is an error of the file.
+    """Open an .npz inside a ``with`` block; any error of reading it becomes an InputError that names the file.
 
-    Raises:
-        InputError: The file is absent, not a regular file or damaged, or an array claims more than is stored.
+    Raises InputError: the file is absent, not a regular file or damaged, or an array claims more than is stored.
     """
     file_size(path, what)
     try:

@@ -1,4 +1,4 @@
-"""SHA-256 of files as they were read: a file that is replaced afterwards does not lend its own to what was read."""
+"""SHA-256 of files, taken of the bytes that were read, not of a file that replaced them later."""
 
 from __future__ import annotations
 
@@ -23,12 +23,12 @@ def recorded(digests: dict[str, str]) -> Iterator[None]:
 
 
 def record(path: Path, digest: Callable[[], hashlib._Hash]) -> None:
-    """Note what was read from a file; ``digest``: SHA-256 of it, asked for where it is recorded."""
+    """Store the SHA-256 of a file's content inside a `recorded` block; ``digest`` is called only there."""
     digests = _recorded.get()
     if digests is not None:
         digests[key(path)] = digest().hexdigest()
 
 
 def key(path: str | os.PathLike[str]) -> str:
-    """What a file is recorded under."""
+    """Absolute path, under which a file's SHA-256 is stored."""
     return os.path.abspath(path)

@@ -1,4 +1,4 @@
-"""Checks of the fields of a perturbation object; what is wrong is raised by the caller's ``fail``."""
+"""Checks of the fields of a perturbation object; the caller's ``fail`` makes the InputError that is raised."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ def fail(name: str, problem: str, fix: str) -> InputError:
 
 
 def known(value: Mapping[str, Any], keys: Collection[str], prefix: str, fail: Fail) -> None:
-    """Refuse a key of ``value`` that is none of ``keys``; editors write "$schema" at the top of a file."""
+    """Raise the error of a key of ``value`` that is not in ``keys``; "$schema" is allowed if ``prefix`` is empty."""
     for key in value:
         if key not in keys and (prefix or key != "$schema"):
             raise fail(f"{prefix}{show(key).strip(chr(39))}", "unknown key", f"the keys are {', '.join(keys)}")
@@ -42,7 +42,7 @@ def interval(value: object, name: str, fail: Fail, *, symmetric: bool = True) ->
 
 
 def vector(value: object, name: str, fail: Fail) -> Vector:
-    """Three finite numbers."""
+    """``value``, a list of three finite numbers, as floats; otherwise raises the error of the field ``name``."""
     if not (isinstance(value, list) and len(value) == 3 and all(is_number(v) for v in value)):
         raise fail(name, f"found {show(value)}", "write three finite numbers")
     return float(value[0]), float(value[1]), float(value[2])

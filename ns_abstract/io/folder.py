@@ -1,4 +1,4 @@
-"""Result folders: used by one command at a time, and foreign files in them are never touched."""
+"""Result folders: locked for one command at a time; files that this program did not write are never touched."""
 
 from __future__ import annotations
 
@@ -14,17 +14,17 @@ from typing import BinaryIO
 from ns_abstract.io.errors import InputError
 from ns_abstract.io.jsonio import load_json
 
-#: Says that the folder is one of results, and is locked while a command writes there.
+#: Lock file that marks a result folder; it is locked while a command writes there.
 MARK = ".ns-abstract.lock"
-#: What results are called; see files.py and verdict_picture.py of `ns_abstract.report`, and `ns_abstract.verify.store`.
+#: Names of results; see files.py and verdict_picture.py of `ns_abstract.report`, and `ns_abstract.verify.store`.
 _RESULT = re.compile(
     r"frame_\d{5,}\.(npz|png)|report\.(json|html)|cells\.sqlite(-wal|-shm)?|verdicts_(\d{5,}|path)\.(svg|png)|cameras\.(svg|png)"
 )
-#: The same of images of counterexamples, in a folder below.
+#: Names of images of counterexamples, in a folder below.
 _IMAGE = re.compile(r"frame_\d{5,}_(pose|\d[\d_-]*)(_\d+)?\.npz")
 #: The film of a loop.
 _FILM = re.compile(r"film(_\d+)?\.(mp4|gif)")
-#: What a killed command may leave of a result; see `ns_abstract.io.atomic`.
+#: Names of unfinished results of killed commands; see `ns_abstract.io.atomic`.
 _PART = re.compile(rf"\.({_RESULT.pattern}|{_IMAGE.pattern}|{_FILM.pattern})\.[0-9a-f]{{8}}\.part")
 #: Keys that report.json of every command has.
 _REPORT_KEYS = {"version", "guarantee", "fingerprint", "command"}
@@ -72,7 +72,7 @@ _held: weakref.WeakSet[LockedFolder] = weakref.WeakSet()
 
 
 def require_held(file: Path) -> None:
-    """Raise OSError where ``file`` would lie in a folder that was locked, and that another one has replaced since."""
+    """Raise OSError if ``file`` lies in a folder that this process locked and that was removed or replaced since."""
     within = file.absolute().parents
     for one in list(_held):
         if one.folder in within and not one.holds():
@@ -95,7 +95,7 @@ def claim(folder: Path) -> LockedFolder:
 
 
 def first_command(folder: Path) -> list[str] | None:
-    """The command that began what a folder's report.json describes, or None."""
+    """Command line, as words, of the run that began the results in a folder's report.json; None: not readable."""
     try:
         document = load_json(folder / "report.json", "report", _REPORT_LIMIT)
     except InputError:

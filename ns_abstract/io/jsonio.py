@@ -25,7 +25,7 @@ INTEGER_DIGITS_LIMIT = 308
 
 @dataclass(frozen=True)
 class InputTuning:
-    """What numbers in files may be; others are refused, so that no bound rests on these."""
+    """Limits of numbers in files; others are refused, so no bound depends on the limits."""
 
     #: Least and largest size of numbers whose products and squares are to keep clear of overflow and underflow.
     least: float = 1e-15
@@ -36,11 +36,11 @@ class InputTuning:
     #: 1).
     rotation: float = 1e-3
     last_row: float = 1e-6
-    #: The same for keyframes that a segment connects, which leads from one rotation to another: what float32 leaves.
+    #: The limit ``rotation`` for keyframes that a segment connects: rounding to float32.
     segment: float = 2e-6
     #: Relative difference of intrinsics up to which two cameras are one.
     lens: float = 1e-6
-    #: Normalised units by which float32 may move a camera of a data set.
+    #: Most normalised units by which float32 may move a camera of a data set.
     placed: float = 1e-3
 
 
@@ -117,15 +117,14 @@ def file_size(path: Path, what: str, fix: str | None = None) -> int:
 
 
 def unusable(value: Any, *, field: str, fix: str, file: Path | None = None) -> InputError:
-    """The error of a field that holds a value which cannot be used."""
+    """An InputError which states that ``field`` holds the unusable ``value``."""
     return InputError(f"found {show(value)}", file=file, field=field, fix=fix)
 
 
 def file_beside(folder: Path, name: str, field: str = "") -> Path:
-    """The file that another one in ``folder`` names under ``field``; it stays in there.
+    """Path of the file ``name``, relative to ``folder``, that a file there names in ``field``.
 
-    Raises:
-        InputError: The name leads out of the folder, also through links.
+    Raises InputError: the name leads out of the folder, also through links.
     """
     try:
         target, inside = (folder / name).resolve(), folder.resolve()
@@ -141,8 +140,7 @@ def file_beside(folder: Path, name: str, field: str = "") -> Path:
 def read_bytes(path: Path, what: str, limit: int) -> bytes:
     """Contents of a regular file of at most ``limit`` bytes.
 
-    Raises:
-        InputError: As :func:`file_size`, or the file is larger than ``limit`` or unreadable.
+    Raises InputError: as :func:`file_size`, or the file is larger than ``limit`` or unreadable.
     """
     size = file_size(path, what)
     if size > limit:
@@ -168,8 +166,7 @@ def read_bytes(path: Path, what: str, limit: int) -> bytes:
 def read_text(path: Path, what: str, limit: int) -> str:
     """Contents of a UTF-8 file of at most ``limit`` bytes; a byte-order mark is dropped.
 
-    Raises:
-        InputError: As :func:`read_bytes`, or the file is empty or not UTF-8.
+    Raises InputError: as :func:`read_bytes`, or the file is empty or not UTF-8.
     """
     data = read_bytes(path, what, limit)
     try:
@@ -184,8 +181,7 @@ def read_text(path: Path, what: str, limit: int) -> str:
 def load_json(path: Path, what: str = "JSON file", limit: int = JSON_BYTES_LIMIT, depth: int = JSON_DEPTH_LIMIT) -> Any:
     """Parse a JSON file strictly, as :func:`parse_json` does.
 
-    Raises:
-        InputError: As :func:`read_text` and :func:`parse_json`.
+    Raises InputError: as :func:`read_text` and :func:`parse_json`.
     """
     return parse_json(read_text(path, what, limit), file=path, depth=depth)
 
@@ -219,7 +215,7 @@ def parse_json(text: str, file: str | Path | None = None, depth: int = JSON_DEPT
 
 
 class _Strict:
-    """Hooks of json.loads that notice what is to be refused; `_check_tokens` then finds where it stands."""
+    """Hooks of json.loads that clear ``good`` at values to be refused; `_check_tokens` then finds the line."""
 
     def __init__(self) -> None:
         self.good = True
@@ -259,7 +255,10 @@ def _deeper(text: str, depth: int) -> bool:
 
 
 def _check_tokens(text: str, file: str | Path | None, depth: int) -> None:
-    """Refuse what Python's json module accepts and JSON does not, on text it has accepted."""
+    """Raise InputError with the line of the first fault that Python's json module accepts in ``text``.
+
+    Faults are repeated keys, NaN, infinity, numbers too large for float64, and nesting of over ``depth`` levels.
+    """
     open_objects: list[set[str]] = []
     for token in _TOKEN.finditer(text):
         problem = fix = key = None

@@ -21,7 +21,7 @@ class Key(NamedTuple):
         why: For what it is used, or why it is irrelevant or refused. Fragments between backquotes stand in the line of
             ``where``.
         where: File and line of Nerfstudio 1.1.5, such as "models/splatfacto.py:588"; "" where that has no such key.
-        accepts: Values of a refused key that change nothing.
+        accepts: Values of a refused key that do not change the picture, and are not refused.
         refuses: Values of a used key that are not supported.
         fix: What a user can do about a refused value.
     """
@@ -61,7 +61,7 @@ class KeyTable:
         return {".".join(names[:k]) for names in parts for k in range(1, len(names))}
 
     def find(self, name: str) -> Key | None:
-        """The entry that covers the dotted ``name``; None where there is none."""
+        """Entry of the dotted ``name`` or of the nearest key above it; None if the table has none."""
         while name not in self._known:
             name, dot, _ = name.rpartition(".")
             if not dot or name in self._sections:
@@ -92,7 +92,7 @@ class KeyTable:
 
 
 def _among(value: Any, values: Sequence[Any]) -> bool:
-    """Whether ``value`` is one of ``values``; texts in any case, and a number is no truth value."""
+    """Whether ``value`` is one of ``values``: same type and equal; texts are compared in lower case."""
     if isinstance(value, str):
         return value.lower() in values
     return any(type(value) is type(other) and value == other for other in values)

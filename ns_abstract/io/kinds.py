@@ -9,7 +9,7 @@ from pathlib import Path
 from ns_abstract.io.errors import InputError
 from ns_abstract.io.packed import open_zip
 
-#: Bytes that are looked at.
+#: Bytes at a file's beginning that are read.
 _HEAD = 512
 _GIVE = "give the config.yml of a run, its folder, or a scene file such as a .ply"
 _EXPORT = "export the scene as .ply"
@@ -58,10 +58,9 @@ def is_ply(path: Path) -> bool:
 
 
 def refuse_other_kind(path: Path) -> None:
-    """Refuse a file whose first bytes (or, where its kind has no mark, whose name) tell that it is of another kind.
+    """Raise InputError for a file of a kind that is no scene, by its first bytes or else by its name.
 
-    Raises:
-        InputError: Names the kind, and the command that converts or fetches it; or the file may not be read.
+    Raises InputError: names the kind, and the command that converts or fetches it; or the file may not be read.
     """
     try:
         head = _head(path)

@@ -9,7 +9,7 @@ from ns_abstract.io.errors import InputError
 
 #: GiB: larger limits are taken for this one, which no machine has.
 MOST_MEMORY = 2.0**20
-#: Part of what is free that is taken where nothing is said, and bytes where the system does not say what is free.
+#: Default share of free memory to use, and bytes to use if the system does not tell what is free.
 _SHARE, _USUAL = 0.8, 8 << 30
 
 
@@ -32,8 +32,7 @@ def available_memory() -> int | None:
 def allowed_memory(limit: float | None) -> int:
     """Bytes that may be taken: ``limit`` in GiB, or most of what is free where it is None.
 
-    Raises:
-        InputError: It is no positive number.
+    Raises InputError: it is no positive number.
     """
     if limit is not None:
         return int(min(positive(limit, "--memory-limit"), MOST_MEMORY) * 2**30)

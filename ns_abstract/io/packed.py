@@ -1,4 +1,4 @@
-"""Contents of packed files, within a limit."""
+"""Readers of .gz files and zip archives that limit the memory that a file can claim."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ _LIST_LIMIT = 16 << 20
 
 
 class _Read(io.RawIOBase):
-    """A file whose content is recorded once it was read to its end."""
+    """A binary stream that records the SHA-256 of the file (`digests.record`) at its end."""
 
     def __init__(self, file: BinaryIO, path: Path) -> None:
         self._file, self._path, self._digest = file, path, hashlib.sha256()

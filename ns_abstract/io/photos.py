@@ -1,4 +1,4 @@
-"""Photos and masks, read from files that nobody vouches for."""
+"""Readers of photos and masks from untrusted files."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from ns_abstract.io.jsonio import read_bytes, show
 _MOST_PIXELS, _MOST_MASK_BYTES = 1 << 26, 64 << 20
 #: Grey level of 255 from which on a pixel of such a mask is white.
 _WHITE = 128
-#: Formats that hold values without loss of meaning: a .jpg's compression is noise like others.
+#: Formats of photos and masks, as Pillow names them.
 _FORMATS = ("PNG", "JPEG", "BMP", "TIFF", "WEBP", "PPM")
 #: Kinds of pixels of a photo, as Pillow names them.
 _COLORS = ("RGB", "RGBA", "P", "PA", "LA")
@@ -33,11 +33,9 @@ _ENDINGS = (".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff", ".webp", ".ppm")
 def read_photo(file: Path, field: str = "--image", *, as_stored: bool = False) -> np.ndarray:
     """The values [H, W, 3] uint8 of a photo of 8 bits by channel.
 
-    ``as_stored``: take the pixels as Nerfstudio takes those of a training photo, which looks at no note of the camera
-    on how it was turned; other photos that are to be shown turned are refused.
-
-    Raises:
-        InputError: The file is missing, is no such photo, holds several, or is partly transparent.
+    ``as_stored``: ignore the EXIF orientation, as Nerfstudio does for training photos. Otherwise a photo with another
+    orientation than 1 is refused. Raises InputError: the file is missing, is no such photo, holds several, or is partly
+    transparent.
     """
     with _opened(file, field, as_stored) as image:
         _refuse_kind(image, file, field)
@@ -54,9 +52,8 @@ def photo_size(file: Path, field: str) -> tuple[int, int]:
 def sequence_photos(folder: Path, field: str = "--image-sequence") -> list[Path]:
     """The pictures of a folder, in the order of their names, but for hidden ones.
 
-    Raises:
-        InputError: There is no such folder, it cannot be listed or holds none, one of them is no file, or the numbers
-            in the names have another order than the names.
+    Raises InputError: there is no such folder, it cannot be listed or holds none, one of them is no file, or the
+    numbers in the names have another order than the names.
     """
     if not os.path.isdir(folder):
         raise InputError("no such folder", file=folder, field=field, fix="give a folder of photos")
@@ -81,7 +78,7 @@ def sequence_photos(folder: Path, field: str = "--image-sequence") -> list[Path]
 
 
 def missing_photos(photos: Sequence[Path]) -> str | None:
-    """Where numbers are left out between photos in the order of their names; None: nowhere, or they have no number."""
+    """Note on the first gap in the numbers of ``photos``, sorted by name; None: no gap, or no single number."""
     parts = [_numbered(photo) for photo in photos]
     if len({len(part) for part in parts}) > 1:
         return None
@@ -104,8 +101,7 @@ def _numbered(photo: Path) -> list[Any]:
 def read_mask(file: Path, size: tuple[int, int], field: str = "--mask") -> np.ndarray:
     """Which pixels [H, W] of a mask are white; it has to be black and white.
 
-    Raises:
-        InputError: The file is missing, of another size, or holds other values.
+    Raises InputError: the file is missing, of another size, or holds other values.
     """
     with _opened(file, field) as image:
         values = np.array(_opaque(image, file, field), np.uint8)[..., :3]
@@ -129,9 +125,9 @@ def read_grey_mask(file: Path) -> np.ndarray:
 
 
 def other_bits(image: Any) -> bool:
-    """Whether Pillow makes bytes of values of another range: of an opened image whose pixels are not read yet.
+    """Whether an opened image, whose pixels are not read yet, stores another number of bits by channel than 8.
 
-    It cuts 16 bits to their upper 8 and spreads 5, and says RGB of all.
+    Pillow converts such values to bytes: it cuts 16 bits to the upper 8, scales 5, and calls both RGB.
     """
     for codec, _, _, arguments in image.tile:
         raw, *more = arguments if isinstance(arguments, tuple) else (arguments,)
@@ -141,15 +137,10 @@ def other_bits(image: Any) -> bool:
 
 
 @contextmanager
-def _opened(
-    file: Path,
-    field: str | None,
-    as_stored: bool = False,
-    png: bytes | None = None,
-) -> Iterator[Any]:
-    """A picture of 8 bits by channel, whose pixels are read inside the block; every error there is one of the file.
+def _opened(file: Path, field: str | None, as_stored: bool = False, png: bytes | None = None) -> Iterator[Any]:
+    """An opened picture of 8 bits by channel, for a ``with`` block; any error in it becomes an InputError of the file.
 
-    ``png``: what the file holds, where it must be a .png.
+    ``png``: the file's content, if it must be a .png.
     """
     from PIL import Image
 

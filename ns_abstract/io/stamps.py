@@ -1,4 +1,4 @@
-"""Identity of files by their content."""
+"""Stamps that identify files by name, size and SHA-256."""
 
 from __future__ import annotations
 
@@ -17,8 +17,7 @@ _CHUNK = 2**20
 def file_stamp(path: str | os.PathLike[str]) -> dict[str, Any]:
     """Identity of a file by content: ``name``, ``bytes`` and ``sha256``; a moved file keeps it.
 
-    Raises:
-        InputError: The file is absent or cannot be read.
+    Raises InputError: the file is absent or cannot be read.
     """
     path = Path(path)
     size = file_size(path, "file")

@@ -1,4 +1,4 @@
-"""Bounds of rays over a box of poses, by cells of every sample or by samples that are followed (design.md, F6-F16)."""
+"""Bounds of rays over a box of poses, by cells of every sample or by followed samples (docs/dev/design.md, F6-F16)."""
 
 from __future__ import annotations
 
@@ -56,7 +56,7 @@ class NerfBounds(RayField):
         return ray_bounds
 
     def _nothing(self, request: RayRequest, parts: tuple[int, ...] | None) -> RayBounds:
-        """What holds of any rays; also by ``parts``, if there are any."""
+        """Return the trivial bounds of any rays; also by ``parts``, if there are any."""
         n = len(request.pixels)
         trivial = np.zeros((n, 3)), np.ones((n, 3)), np.ones((n, self.distances.size), np.float32), 0, self.displacement
         if parts is None:
@@ -67,10 +67,7 @@ class NerfBounds(RayField):
     def _followed(
         self, paths: SamplePaths, request: RayRequest, given: Division | None
     ) -> tuple[RayBounds, np.ndarray]:
-        """Bounds from samples that are followed; [0, 1] where the box is too wide for that.
-
-        Also [n] whether the box is so narrow that it is one cell to begin with.
-        """
+        """Return bounds from followed samples, [0, 1] where the box is too wide, and [n] whether it is one cell."""
         bundle = RayBundle(request.pose_set, request.box, request.pixels, paths.degree)
         moves = bundle.displacement(self.distances, self.lengths)
         division = self.division(moves) if given is None else given
@@ -91,7 +88,7 @@ class NerfBounds(RayField):
         return rays, start == 0
 
     def _apart(self, request: RayRequest, given: Division | None, by_part: bool, displacement: float) -> RayBounds:
-        """Bounds from cells of every sample, or of the bins that samples lie in."""
+        """Return bounds from cells of every sample, or of the bins that samples lie in."""
         n, samples, box = len(request.pixels), self.distances.size, request.box
         bundle = RayBundle(request.pose_set, box, request.pixels, self.taylor, self.swept)
         moves = bundle.displacement(self.distances, self.lengths)
@@ -124,7 +121,7 @@ class NerfBounds(RayField):
         return work.run(request.shifts, by_part)
 
     def _edges(self, paths: SamplePaths, bundle: RayBundle, division: Division) -> tuple[np.ndarray, np.ndarray]:
-        """Bounds [n parts, .] of the fine samples' edges by parts of the poses (design.md, F14)."""
+        """Return bounds [n parts, .] of the fine samples' edges by parts of the poses (design.md, F14)."""
         monomials = np.prod(paths.coarse.basis.nodes[:, None, :] ** bundle.exponents, axis=-1)
         origin, direction = monomials @ bundle.origin, monomials @ bundle.direction
         low, high = paths.edges(
@@ -133,7 +130,7 @@ class NerfBounds(RayField):
         return low.reshape(-1, low.shape[2]), high.reshape(-1, high.shape[2])
 
     def division(self, moves: np.ndarray, most_parts: int = _PARTS, deeper: int | None = None) -> Division | None:
-        """`division_for` for samples that move by ``moves`` [n, samples, d], as wide as the network's bounds bear."""
+        """Return `division_for` samples that move by ``moves`` [n, samples, d], with the widest usable cells."""
         d = moves.shape[2]
         if self.paths is None:
             usual, finer = _DEEPER.get(d, _DEEPER_MORE), _FINER.get(d, 0)

@@ -15,7 +15,7 @@ def check_device(device: str | None) -> str:
     """Return the device on which fields are bounded; "cpu" by default.
 
     Raises:
-        InputError: It is not there, or does not calculate in float64.
+        InputError: It is not there, or does not compute in float64.
     """
     if device in (None, "cpu"):
         return "cpu"
@@ -34,7 +34,7 @@ def check_device(device: str | None) -> str:
 def processes_that_fit(needed: int, most_processes: int) -> int:
     """Return how many processes, at most ``most_processes``, fit into a GPU's memory at ``needed`` bytes each.
 
-    Found once: what they hold afterwards is no longer free. Raises InputError where not one fits.
+    It is found once, before their memory is taken. Raises InputError where not one fits.
     """
     import torch
 

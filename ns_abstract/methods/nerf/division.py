@@ -15,11 +15,12 @@ import numpy as np
 class Division:
     """Nested uniform subdivisions of a box, and the parts for which bounds are stored.
 
-    A line has levels of 3, 6, 12, ... cells between those of 2, 4, 8, ...: cells are then nearer to the width that
-    the network's bounds bear.
+    With one parameter there are levels of 3, 6, 12, ... cells between those of 2, 4, 8, ...: cells are then closer to
+    the largest width that bounds of the network bear.
 
     Attributes:
-        axes: Axis that is halved from each level to the next; of a line, to that with twice as many cells.
+        axes: Axis that is halved from each level to the next; with one parameter, to the level with twice as many
+            cells.
         finer: Halvings of the deepest level's cells into parts, by axis.
     """
 
@@ -44,7 +45,7 @@ class Division:
         return len(self._levels) - 1
 
     def counts(self, level: int) -> tuple[int, ...]:
-        """Cells by axis of a level."""
+        """Return cells by axis of a level."""
         return self._levels[level]
 
     @cached_property
@@ -65,21 +66,21 @@ class Division:
         return tuple(p // c for p, c in zip(self.parts, self.counts(level), strict=True))
 
     def boxes(self, level: int) -> tuple[np.ndarray, np.ndarray]:
-        """[cells, d] lower and upper ends in [-1, 1]."""
+        """Return [cells, d] lower and upper ends in [-1, 1] of a level's cells."""
         counts = np.array(self.counts(level), np.int64)
         cell_places = list(np.ndindex(*counts.tolist()))
         places = np.array(cell_places, np.float64).reshape(len(cell_places), self.dimensions)
         return 2.0 * places / counts - 1.0, 2.0 * (places + 1.0) / counts - 1.0
 
     def members(self, level: int) -> np.ndarray:
-        """[cells, parts of a cell] flat numbers of the parts of every cell."""
+        """Return [cells, parts of a cell] flat numbers of the parts of every cell of a level."""
         counts, inner = self.counts(level), self.inner(level)
         whole = np.arange(math.prod(self.parts)).reshape([n for pair in zip(counts, inner, strict=True) for n in pair])
         order = [*range(0, 2 * self.dimensions, 2), *range(1, 2 * self.dimensions, 2)]
         return whole.transpose(order).reshape(math.prod(counts), math.prod(inner))
 
     def first(self, moves: np.ndarray, displacement: float) -> np.ndarray:
-        """[...] the first level on whose cells samples that move by ``moves`` [..., d] over the box bear it."""
+        """Return [...] the first level whose cells suit samples that move by ``moves`` [..., d] over the box."""
         inverse = (1.0 / np.array(self.counts(level), np.float64) for level in range(self.levels))
         first_levels = np.zeros(moves.shape[:-1], np.int64)
         for level, row in enumerate(inverse):
@@ -87,7 +88,7 @@ class Division:
         return first_levels
 
     def children(self, level: int, cells: np.ndarray) -> np.ndarray:
-        """[2 n] cells of the level `below` inside ``cells`` [n]."""
+        """Return [2 n] cells of the level `below` inside ``cells`` [n]."""
         counts, halves = self.counts(level), self.counts(self.below[level])
         axis = int(np.argmax(np.array(halves) > counts))
         places = np.array(np.unravel_index(cells, counts)).reshape(self.dimensions, -1)
@@ -132,7 +133,7 @@ def division_for(
 
 @dataclass(frozen=True)
 class RayCells:
-    """Cells of one level, each of a ray and perhaps of one of its samples: [k] numbers."""
+    """Cells of one level, each of a ray and perhaps of one of its samples: numbers [k]."""
 
     ray: np.ndarray
     cell: np.ndarray
@@ -142,17 +143,17 @@ class RayCells:
         return self.ray.size
 
     def take(self, which: np.ndarray | slice) -> RayCells:
-        """Some of them."""
+        """Return some of the cells."""
         parts: list[Any] = [None if part is None else part[which] for part in vars(self).values()]
         return RayCells(*parts)
 
     def chunks(self, size: int) -> Iterator[RayCells]:
-        """At most ``size`` at a time."""
+        """Yield the cells in chunks of at most ``size``."""
         return (self.take(slice(start, start + size)) for start in range(0, len(self), size))
 
 
 def join_cells(parts: Sequence[RayCells]) -> RayCells:
-    """All cells of ``parts``, one at least, of samples or of whole rays."""
+    """Return all cells of ``parts``, at least one, of samples or of whole rays."""
     columns = zip(*(vars(part).values() for part in parts), strict=True)
     whole: list[Any] = [None if column[0] is None else np.concatenate(column) for column in columns]
     return RayCells(*whole)
@@ -163,7 +164,10 @@ ENDS = (np.minimum, np.maximum)
 
 
 def regroup_parts(values: np.ndarray, end: np.ufunc, counts: tuple[int, ...]) -> np.ndarray:
-    """Bounds [n, shifts, *parts, 3] of equal parts of a box for others, ``counts`` by axis: ``end`` of all met."""
+    """Return bounds [n, shifts, *parts, 3] of equal parts of a box for other parts, ``counts`` by axis.
+
+    ``end`` (minimum or maximum) combines the bounds of all parts that a new part meets.
+    """
     for axis, count in enumerate(counts, start=2):
         size = values.shape[axis]
         starts = np.arange(count) * size // count

@@ -12,7 +12,7 @@ from ns_abstract.methods.nerf.scene import Encoding, FieldWeights, Layer
 
 
 def encode(x: Tensor, encoding: Encoding) -> Tensor:
-    """[..., size] encoded points of ``x`` [..., 3] (``NeRFEncoding.pytorch_fwd``, then the input itself)."""
+    """Return the encoding [..., size] of points ``x`` [..., 3] (``NeRFEncoding.pytorch_fwd``, then the input)."""
     frequencies = torch.from_numpy(encoding.frequencies).to(x)
     angles = ((2.0 * math.pi * x)[..., None] * frequencies).flatten(-2)
     return torch.cat([torch.sin(torch.cat([angles, angles + 0.5 * math.pi], dim=-1)), x], dim=-1)
@@ -34,7 +34,7 @@ class Field:
         self._head = [put(layer) for layer in weights.head]
 
     def density(self, x: Tensor) -> tuple[Tensor, Tensor]:
-        """Density [...] per unit of length of points ``x`` [..., 3], and the base's output [..., width]."""
+        """Return density [...] per unit of length of points ``x`` [..., 3], and the base's output [..., width]."""
         encoded = encode(x, self.weights.position)
         h = encoded
         for layer, (weight, bias) in zip(self.weights.base, self._base, strict=True):
@@ -44,7 +44,7 @@ class Field:
         return functional.softplus(functional.linear(h, *self._density))[..., 0], h
 
     def color(self, base: Tensor, direction: Tensor) -> Tensor:
-        """RGB [..., 3] of the base's output [..., width] seen along ``direction`` [..., 3] (unit vectors)."""
+        """Return RGB [..., 3] for the base's output [..., width] along ``direction`` [..., 3] (unit vectors)."""
         h = torch.cat([encode(direction, self.weights.direction), base], dim=-1)
         for weight, bias in self._head:
             h = functional.relu(functional.linear(h, weight, bias))

@@ -45,7 +45,7 @@ class StackedLayers(NamedTuple):
 
 
 def stacked(layers: Sequence[LayerWeights]) -> StackedLayers:
-    """``layers``, one at least, whose columns are of one type, one behind the other."""
+    """Return ``layers``, at least one, whose columns have one type, concatenated."""
     shapes = np.array([(len(w.seen), len(w.wide), len(w.bias)) for w in layers], np.int64)
     wide = [part.ravel() for w in layers for part in (w.seen, w.wide)]
     # nobody multiplies columns by rows of an encoded vector
@@ -60,7 +60,7 @@ def stacked(layers: Sequence[LayerWeights]) -> StackedLayers:
 
 
 def _joined(parts: list[np.ndarray]) -> np.ndarray:
-    """``parts`` one behind the other, from the beginning of a line on."""
+    """Return ``parts`` concatenated, beginning at a cache line."""
     size, kind = sum(part.size for part in parts), parts[0].dtype
     room = np.empty(size + LINE // kind.itemsize, kind)
     first = -room.ctypes.data % LINE // kind.itemsize
@@ -68,7 +68,7 @@ def _joined(parts: list[np.ndarray]) -> np.ndarray:
 
 
 class FieldOutputs(NamedTuple):
-    """B pieces behind a last layer: polynomials [B, m, n], sums of absolute columns and box [B, n]."""
+    """Results of the last layer for B pieces: polynomials [B, m, n], sums of absolute columns and box [B, n]."""
 
     poly: np.ndarray
     sums: np.ndarray
@@ -84,7 +84,7 @@ class Workspace(NamedTuple):
 
 @njit(cache=True, error_model="numpy")
 def _workspace(m, n, columns, kind):
-    """A `Workspace` for layers of at most n neurons, m coefficients and so many ``columns``."""
+    """Return a `Workspace` for layers of at most n neurons, m coefficients and ``columns`` columns."""
     k = CHUNK * n
     layer = LayerOutput(
         np.empty(m * k), np.empty(columns * n, kind), np.empty(columns, np.int64), np.empty(k), np.empty(k)
@@ -98,13 +98,13 @@ def _workspace(m, n, columns, kind):
 
 @njit(cache=True, error_model="numpy")
 def _table(flat, rows, n):
-    """The first ``rows`` of n numbers each."""
+    """Return the first ``rows`` of n numbers each."""
     return flat[: rows * n].reshape((rows, n))
 
 
 @njit(cache=True, error_model="numpy")
 def _layer(layers, i):
-    """The layer i as `layer_kernel.LayerWeights`."""
+    """Return layer i as `layer_kernel.LayerWeights`."""
     seen_inputs, inputs, n = layers.shapes[i]
     first, second, third = layers.begins[i]
     rows, stride = seen_inputs + inputs, n + -n % (LINE // 2)
@@ -126,7 +126,7 @@ def _layer(layers, i):
 
 @njit(cache=True, error_model="numpy")
 def _step(z, encoded, remainder, weights, grid, limit, room):
-    """One layer and its activation on the pieces ``z``; returns what is kept of them in ``room``."""
+    """Propagate the pieces ``z`` through one layer and its activation; return the result, stored in ``room``."""
     (pieces, m, _), n = z.poly.shape, weights.bias.shape[0]
     poly, columns, owner, sums, box = room.layer
     slope, size, spread, failed, count, piece, neuron, error = room.activation
@@ -148,7 +148,7 @@ def _step(z, encoded, remainder, weights, grid, limit, room):
 
 @njit(cache=True, error_model="numpy")
 def _copy(source, target):
-    """All of ``source`` into ``target``, which is as large: an assignment looks at every index."""
+    """Copy ``source`` to ``target`` of the same size; an assignment would check every index."""
     flat, result = source.reshape(-1), target.reshape(-1)
     for i in range(flat.shape[0]):
         result[i] = flat[i]
@@ -156,10 +156,9 @@ def _copy(source, target):
 
 @njit(cache=True, error_model="numpy")
 def _piecewise(z, first, new, begin, past):
-    """Pieces ``begin`` to ``past`` of ``z``, whose columns, and those of one neuron, begin at ``first`` and ``new``.
+    """Return pieces ``begin`` to ``past`` of ``z``, and where the next piece's columns begin.
 
-    Returns:
-        The pieces, with owners from 0 on, and where the next one's columns begin.
+    Their columns, and the columns of one neuron, begin at ``first`` and ``new``. Owners are numbered from 0 on.
     """
     last, latest = first, new
     while last < z.owner.shape[0] and z.owner[last] < past:
@@ -179,7 +178,7 @@ def _piecewise(z, first, new, begin, past):
 
 @njit(cache=True, error_model="numpy")
 def _keep(found, begin, out, columns, terms):
-    """Columns and new error terms of ``found``, whose pieces are ``begin`` and later ones in ``out``, where they end.
+    """Append the columns and new error terms of ``found`` to ``out``, as pieces from ``begin`` on.
 
     Returns:
         Where the next ones begin.

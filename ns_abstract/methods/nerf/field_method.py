@@ -1,4 +1,4 @@
-"""What the methods of both kinds of field share."""
+"""The common parts of the methods of both kinds of field."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ if TYPE_CHECKING:
 
 
 class FieldMethod(Method):
-    """What is so of any field, which has no elements."""
+    """The base of methods of fields, which have no scene elements."""
 
     guarantee = "real-sound"
 
@@ -41,13 +41,13 @@ class FieldMethod(Method):
         return self._named.dataparser.stated_scale
 
     def prepare(self, perturbations: Sequence[Perturbation]) -> None:
-        """Refuse what needs Gaussians. Raises InputError where a set varies the scene."""
+        """Raise InputError where a set varies the scene, which needs Gaussians."""
         if any(perturbation.scene for perturbation in perturbations):
             raise InputError("a NeRF has no Gaussians", field="scene", fix="leave the key out")
 
 
 def check_arithmetic(arithmetic: str | None) -> None:
-    """Raise InputError where bounds of float32 are asked for."""
+    """Raise InputError where bounds of float32 are requested."""
     if arithmetic not in (None, "real"):
         raise InputError(
             "float32 evaluations of a NeRF's networks cannot be enclosed tightly", field="--arithmetic", fix="use real"
@@ -55,13 +55,13 @@ def check_arithmetic(arithmetic: str | None) -> None:
 
 
 def refuse_layers(layers: bool) -> None:
-    """Raise InputError where depth or accumulation are asked for: a NeRF's depth is a median."""
+    """Raise InputError where depth or accumulation are requested: a NeRF's depth is a median."""
     if layers:
         raise InputError("depth and accumulation of a NeRF are not bounded", field="--outputs", fix="leave it out")
 
 
 def arrays_digest(arrays: Iterable[np.ndarray]) -> hashlib._Hash:
-    """SHA-256 of the arrays' shapes and contents, one after another."""
+    """Return the SHA-256 digest of the arrays' shapes and contents, one after another."""
     digest = hashlib.sha256()
     for array in arrays:
         digest.update(repr(array.shape).encode())
@@ -72,7 +72,10 @@ def arrays_digest(arrays: Iterable[np.ndarray]) -> hashlib._Hash:
 def picture_of_parameters(
     poses: PoseBox, picture: Callable[[PinholeCamera, torch.Tensor, Any], torch.Tensor]
 ) -> Callable[[torch.Tensor], torch.Tensor]:
-    """Parameter values [d] to the picture [H, W, 3]; ``picture`` draws that of a camera, a pose and a colour shift."""
+    """Return a function from parameter values [d] to the picture [H, W, 3].
+
+    ``picture`` renders for a camera, a pose and a colour shift.
+    """
     from ns_abstract.geometry.differentiable_pose import differentiable_pose
 
     pose, camera = differentiable_pose(poses.geometry), poses.camera

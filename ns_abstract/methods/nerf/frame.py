@@ -1,4 +1,4 @@
-"""One frame of a NeRF, ready for refinement: bounds, renders and motion of its set of poses (design.md, R5)."""
+"""One frame of a NeRF, ready for refinement: bounds, renders and motion of its pose set (docs/dev/design.md, R5)."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ from ns_abstract.refine.protocol import Bounds, Frame
 
 @dataclass(frozen=True)
 class FieldTuning:
-    """Tolerances of fields' frames and steps of their estimates. None of them decides whether a bound holds."""
+    """Tolerances of fields' frames and steps of their estimates; soundness does not depend on them."""
 
     #: What an open sample may move a pixel by on boxes a quarter as wide as the set, as a part of the pixels' mean
     #: variation over the set; less on narrower boxes.
@@ -79,23 +79,23 @@ class RayContext:
     alpha: np.ndarray
 
     def of(self, tiles: np.ndarray) -> np.ndarray:
-        """[t, samples] bounds of ``tiles`` [t], which are among its own."""
+        """Return bounds [t, samples] of ``tiles`` [t], which are among its own."""
         return self.alpha[np.searchsorted(self.tiles, tiles)]
 
     @property
     def nbytes(self) -> int:
-        """Memory that it holds."""
+        """The bytes that it holds."""
         return self.tiles.nbytes + self.alpha.nbytes
 
     @property
     def shown(self) -> None:
-        """A field has no elements."""
+        """None: a field has no elements."""
         return None
 
 
 @lru_cache(maxsize=1)
 def _processes(count: int) -> Processes:
-    """Kept until this process ends: what they import and compile is worth seconds."""
+    """Return worker processes that live until this process ends, as importing and compiling takes seconds."""
     return Processes(count)
 
 
@@ -104,7 +104,7 @@ _here: dict[bytes, NerfBounds] = {}
 
 
 def _bound_share(frame: bytes, bounds: tuple[Any, ...], displacement: float, arguments: Sequence[Any]) -> RayBounds:
-    """`BoundedRays.rays` in another process; ``bounds`` are the constructor's arguments."""
+    """Do `BoundedRays.rays` in another process; ``bounds`` are the constructor's arguments."""
     if frame not in _here:
         _here.clear()
         _here[frame] = NerfBounds(*bounds)
@@ -113,15 +113,15 @@ def _bound_share(frame: bytes, bounds: tuple[Any, ...], displacement: float, arg
 
 
 class FieldFrame(Frame):
-    """Bounds and renders one frame's set of poses of a field.
+    """Bounds and renders one frame's pose set of a field.
 
-    Every ray is a tile of its own. The set as a whole is bounded by [0, 1] without work, so that refinement can take
-    ray after ray.
+    Every ray is a tile of its own. The whole set is bounded by [0, 1] without work, so that refinement can take ray
+    after ray.
 
     Args:
-        share: Rays that are bounded together.
-        at_once: Rays between two looks at the goal.
-        workers: Shares that are bounded side by side.
+        share: Number of rays that are bounded together.
+        at_once: Number of rays between two checks of the goal.
+        workers: Number of shares that are bounded side by side.
     """
 
     tilewise = True
@@ -149,22 +149,22 @@ class FieldFrame(Frame):
         return np.stack([tiles // self.across, tiles % self.across], axis=1)
 
     def render(self, values: np.ndarray, tiles: np.ndarray | None = None) -> np.ndarray:
-        """Rays [t, 1, 1, 3] float32 of the concrete image at parameter values [d]."""
+        """Return rays [t, 1, 1, 3] float32 of the image at parameter values [d]."""
         return self.precise(values, tiles).astype(np.float32)
 
     def precise(self, values: np.ndarray, tiles: np.ndarray | None = None) -> np.ndarray:
-        """What `render` rounds: float64."""
+        """Return the result of `render` before rounding: float64."""
         which = np.arange(self.tile_count) if tiles is None else tiles
         shift = color_shift(self.pose_set, values)
         colors = self.renderer.pixels(self.pose_set.camera, self.pose_set.pose(values), self._pixels(which), shift)
         return colors[:, None, None, :]
 
     def feasible(self, box: ParameterBox) -> ParameterBox | None:
-        """All of ``box``: every parameter in it belongs to a pose of the set."""
+        """Return ``box``: every parameter in it belongs to a pose of the set."""
         return box
 
     def motion(self, box: ParameterBox) -> np.ndarray:
-        """[d] pixels that points at a typical distance move by over each parameter's range (an estimate)."""
+        """Return the estimated motion [d] in pixels of points at a typical distance over each parameter's range."""
         d = box.dimensions
         low, high = np.array(box.lower), np.array(box.upper)
         distance = float(self.bounds.distances[self.bounds.distances.size // 2])
@@ -195,9 +195,9 @@ class FieldFrame(Frame):
         self, boxes: Sequence[ParameterBox], tiles: np.ndarray, within: RayContext | None = None,
         keep_linear: bool = False, pixels: np.ndarray | None = None,
     ) -> list[Bounds]:  # fmt: skip
-        """Bounds of the rays ``tiles`` over each of ``boxes``; ``within``: of these rays and a box around them.
+        """Return bounds of the rays ``tiles`` over each of ``boxes``; ``within``: of these rays and an enclosing box.
 
-        Rays that there is no time for any more (`ns_abstract.execution.cancellation`) are bounded by [0, 1].
+        Rays for which there is no time (`ns_abstract.execution.cancellation`) are bounded by [0, 1].
         """
         tiles = np.asarray(tiles)
         if self.box.dimensions > 0 and self.box in boxes:
@@ -213,7 +213,7 @@ class FieldFrame(Frame):
         return part_bounds
 
     def _box(self, lower: np.ndarray, upper: np.ndarray, context: RayContext | None, keep_linear: bool) -> Bounds:
-        """What is told of bounds [t, 3]."""
+        """Return `Bounds` from bounds [t, 3] of rays."""
         d = self.box.dimensions
         low, high = (side.reshape(-1, 1, 1, 3) for side in outward(lower, upper))
         linear = None
@@ -223,14 +223,14 @@ class FieldFrame(Frame):
         return Bounds(low, high, np.zeros(d), context, linear)
 
     def _unknown(self, count: int) -> RayBounds:
-        """What holds of any ``count`` rays."""
+        """Return the trivial bounds of ``count`` rays."""
         alpha = np.ones((count, self.bounds.distances.size), np.float32)
         return RayBounds(np.zeros((count, 3)), np.ones((count, 3)), alpha, 0, self.bounds.displacement)
 
     def _parts(
         self, boxes: Sequence[ParameterBox], tiles: np.ndarray, known: np.ndarray | None
     ) -> list[list[RayBounds]]:
-        """Bounds of rays over each of ``boxes``, in some pieces; [0, 1] where there is no time for more."""
+        """Return bounds of rays over each of ``boxes``, in several groups; [0, 1] where there is no time."""
         bounds_by_box: list[list[RayBounds]] = [[] for _ in boxes]
         with suppress(WorkCancelledError):
             for first in range(0, tiles.size, self.tiles_at_once):
@@ -251,7 +251,7 @@ class FieldFrame(Frame):
     def _batch(
         self, boxes: Sequence[ParameterBox], tiles: np.ndarray, known: np.ndarray | None
     ) -> list[list[RayBounds]]:
-        """Bounds over each of ``boxes`` of rays that are worked on together, in shares for all workers."""
+        """Return bounds over each of ``boxes`` of rays that are bounded together, in shares for all workers."""
         size = min(self._share, -(-tiles.size // self.workers))
         shares = []
         for box in boxes:
@@ -279,14 +279,14 @@ class FieldFrame(Frame):
         return [parts[i : i + each] for i in range(0, len(parts), each)]
 
     def _run(self, calls: Sequence[Sequence[Any]]) -> list[RayBounds]:
-        """`BoundedRays.rays` with the arguments of each call, side by side where there are several."""
+        """Return `BoundedRays.rays` with the arguments of each call, side by side where there are several."""
         parts = [part for part in self._tried(calls) if part is not None]
         if len(parts) < len(calls):
             raise WorkCancelledError
         return parts
 
     def _tried(self, calls: Sequence[Sequence[Any]]) -> list[RayBounds | None]:
-        """See `_run`; None: there was no time for a call. One after another."""
+        """Return `_run` one call after another; None: there was no time for a call."""
         parts: list[RayBounds | None] = []
         with suppress(WorkCancelledError):
             for call in calls:
@@ -300,12 +300,12 @@ class FieldFrame(Frame):
     def cell_bounds(
         self, box: ParameterBox, weigh: Callable[[], np.ndarray | None] | None = None, most_rays: int | None = None
     ) -> Bounds:
-        """All rays over a cell ``box`` with linear bounds, from strips of the set that are kept.
+        """Return linear bounds of all rays over a cell ``box``, from stored bounds over strips of the set.
 
         Args:
-            most_rays: Rays that are bounded, about, the first of `rays`; the others are left at [0, 1]. All if None.
-            weigh: Gives [H, W, 3] what part of the margin a unit of each pixel's width may cost, or None; asked only
-                where rays could be refined.
+            most_rays: Approximate number of bounded rays, the first of `rays`; the others stay at [0, 1]. All if None.
+            weigh: Returns [H, W, 3] the fraction of the margin that a unit of each pixel's width costs, or None; called
+                only where rays could be refined.
         """
 
         def weights() -> np.ndarray | None:
@@ -327,13 +327,13 @@ class FieldFrame(Frame):
         return Bounds(lower.reshape(shape), upper.reshape(shape), slopes, None, sets)
 
     def _every(self, part: np.ndarray) -> np.ndarray:
-        """Bounds of all rays, of those of `rays`."""
+        """Return bounds of all rays from those of `rays`."""
         whole = np.zeros((self.tile_count, *part.shape[1:]), part.dtype)
         whole[self.rays] = part
         return whole
 
     def effort(self) -> tuple[float | None, int]:
-        """Seconds that one ray takes over one strip of the set, about, and how many strips there are.
+        """Return the estimated seconds of one ray over one strip of the set, and the number of strips.
 
         None: there was no time to find out (`ns_abstract.execution.cancellation`).
         """
@@ -343,21 +343,21 @@ class FieldFrame(Frame):
         return strips.effort, strips.count
 
     def observe(self, tiles: np.ndarray, lower: np.ndarray, upper: np.ndarray) -> None:
-        """Take the inner bounds [t, 1, 1, 3] of ``tiles`` [t] so far."""
+        """Receive the inner bounds [t, 1, 1, 3] of ``tiles`` [t]."""
         places = np.full(self.tile_count, -1)
         places[tiles] = np.arange(tiles.size)
         self._inner = places, lower, upper
 
     def plan(self, visible: int | None, lower: np.ndarray, upper: np.ndarray) -> list[str]:
-        """What was left out for this frame, given what refinement found."""
+        """Return sentences on what was left out for this frame, given the bounds of refinement."""
         untreated = int(((lower == 0.0) & (upper == 1.0)).all(axis=-1).sum())
         total = lower.shape[0] * lower.shape[1]
         return [f"{untreated:,} of {total:,} rays left at [0, 1]: the work ended before them"] if untreated else []
 
     def _reached(self, box: ParameterBox, tiles: np.ndarray, shifted: bool) -> tuple[np.ndarray, np.ndarray]:
-        """Ends [n, 3] of the colours reached over the box or, where a refinement reports them, the set.
+        """Return ends [n, 3] of rendered colours over the box or, where a refinement reports them, over the set.
 
-        Before any shift of colours: where they are ``shifted``, what a refinement sees is of no use.
+        They are those before any shift of colours: if they are ``shifted``, a refinement's are not used.
         """
         if self._inner is not None and not shifted:
             places, *sides = self._inner
@@ -372,11 +372,11 @@ class FieldFrame(Frame):
         return low, high
 
     def _shifts(self, box: ParameterBox) -> list[Shifts]:
-        """Equal parts of the box's shifts of colours, which cost nothing to tell apart; empty: there are none."""
+        """Return equal parts of the box's colour shifts, which cost little to bound apart; empty: there are none."""
         return shift_parts(shift_ends(box, self.pose_set.fixed, _SHIFT_PARTS))
 
     def _tolerance(self, box: ParameterBox) -> float:
-        """Narrower boxes are asked for when the bounds of wider ones are not good enough."""
+        """Return the tolerance for a box: smaller for narrower boxes, as bounds of wider ones did not suffice."""
         box = box.without(COLOR_SHIFTS)
         if not box.dimensions:
             return _TUNING.least_tolerance
@@ -389,7 +389,7 @@ class FieldFrame(Frame):
 
     @cached_property
     def _variation(self) -> float:
-        """Mean over some rays of how far their colours move over the set (an estimate)."""
+        """Estimated mean motion of colours over the set, from a sample of rays."""
         rng = np.random.default_rng(0)
         tiles = np.sort(rng.permutation(self.tile_count)[: _TUNING.look_rays])
         values = [*self.box.sample(_TUNING.look_poses - 2, rng), np.array(self.box.lower), np.array(self.box.upper)]
@@ -421,7 +421,7 @@ class NerfFrame(FieldFrame):
         self.renderer: NerfRenderer
 
     def _tried(self, calls: Sequence[Sequence[Any]]) -> list[RayBounds | None]:
-        """See `_run`; None: there was no time for a call. In processes."""
+        """Return `_run` in processes; None: there was no time for a call."""
         if len(calls) == 1 or self.workers == 1:
             return super()._tried(calls)
         engine = _processes(self.workers)

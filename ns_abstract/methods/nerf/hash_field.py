@@ -1,4 +1,4 @@
-"""A trained nerfacto as plain arrays: hash grids, small networks and the places of its samples.
+"""A trained nerfacto as plain arrays: hash grids, small networks and the positions of its samples.
 
 The semantics are those of Nerfstudio's torch implementation (nerfstudio/field_components/encodings.py,
 ``HashEncoding.pytorch_fwd``; fields/nerfacto_field.py; fields/density_fields.py), at the parameters' exact values.
@@ -57,7 +57,7 @@ class DenseNet:
 
     @property
     def text(self) -> str:
-        """Its widths, from inputs to outputs."""
+        """The layers' widths as text, from inputs to outputs."""
         return "-".join(str(n) for n in (self.weights[0].shape[1], *(w.shape[0] for w in self.weights)))
 
 
@@ -76,11 +76,11 @@ class ProposalField:
 
 @dataclass(frozen=True)
 class NerfactoField:
-    """What nerfacto evaluates for a ray in evaluation.
+    """The fields and sampling that nerfacto evaluates for a ray.
 
     Rays begin at ``near`` and end at ``far``. Positions x are contracted (nerfstudio's ``SceneContraction`` of the
-    maximum norm) to u in (-2, 2)^3, and the grids take ``(u + 2) / 4``. Every round evaluates its proposal field in
-    the middles of its intervals and places the edges of the next round's by the weights.
+    maximum norm) to u in (-2, 2)^3, and the grids take ``(u + 2) / 4``. Every round evaluates its proposal field in the
+    middles of its intervals and places the edges of the next round's intervals by the weights.
 
     Attributes:
         density_net: Outputs are the logarithm of density over ``average_init_density``, then geometric features.
@@ -91,8 +91,8 @@ class NerfactoField:
         proposals: The proposal field of every round; one field may serve several.
         samples: Numbers of intervals of every round, then of the picture's samples.
         near, far: Distances of the rays' ends, units of the normalised frame.
-        spacing: "piecewise": edges of the first round are equally spaced in x / 2 below distance 1 and in
-            1 - 1 / (2 x) above; "uniform": in distance.
+        spacing: "piecewise": edges of the first round are equally spaced in x / 2 below distance 1 and in 1 - 1 / (2 x)
+            above; "uniform": in distance.
         background: [3] RGB behind the last sample, or "last_sample": the colour of the last sample.
         contraction: Whether positions are contracted; False is not supported.
     """
@@ -110,7 +110,7 @@ class NerfactoField:
     contraction: bool = True
 
     def arrays(self) -> list[NDArray[np.float64] | NDArray[np.int64]]:
-        """All parameters in a fixed order."""
+        """Return all parameters in a fixed order."""
         encodings = (self.encoding, *(one.encoding for one in self.proposals))
         nets = (self.density_net, self.color_net, *(one.net for one in self.proposals))
         grids = [array for one in encodings for array in (one.table, one.resolutions)]
@@ -118,7 +118,7 @@ class NerfactoField:
 
     @property
     def text(self) -> str:
-        """The architecture in a few words."""
+        """The architecture as text."""
         levels, size, features = self.encoding.table.shape
         steps = "/".join(map(str, self.samples))
         return (

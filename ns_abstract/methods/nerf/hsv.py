@@ -1,4 +1,4 @@
-"""Hue and saturation of the colours of all points, shifted together: concrete and as bounds (design.md, F9)."""
+"""Shifts of hue and saturation of all points' colours: for renders, and as bounds (docs/dev/design.md, F9)."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ Range = tuple[float, float]
 
 
 def color_shift(pose_set: PoseBox, values: Any) -> tuple[Any, Any] | None:
-    """Hue (turns) and saturation that are added at parameter ``values`` [d] of a set; None where neither is named."""
+    """Return the shifts of hue (turns) and saturation at parameter ``values`` [d] of a set; None if it has neither."""
     named = {**pose_set.fixed, **dict(zip(pose_set.box.names, values, strict=True))}
     if not any(name in named for name in COLOR_SHIFTS):
         return None
@@ -28,7 +28,7 @@ def color_shift(pose_set: PoseBox, values: Any) -> tuple[Any, Any] | None:
 
 
 def shift_ends(box: ParameterBox, fixed: Mapping[str, float], count: int) -> list[np.ndarray]:
-    """Edges of ``count`` equal parts of the ranges of hue and saturation in ``box``; two where one is ``fixed``."""
+    """Return edges of ``count`` equal parts of hue's and saturation's ranges in ``box``; two where one is ``fixed``."""
     ends_by_shift = []
     for name in COLOR_SHIFTS:
         low = high = fixed.get(name, 0.0)
@@ -41,17 +41,17 @@ def shift_ends(box: ParameterBox, fixed: Mapping[str, float], count: int) -> lis
 
 
 def shift_parts(ends: Sequence[np.ndarray]) -> list[tuple[Range, Range]]:
-    """Intervals of hue and saturation between `shift_ends`, the latter running faster; empty: nothing is shifted."""
+    """Return intervals of hue and saturation between `shift_ends`, the latter running faster; empty: no shifts."""
     ranges = [list(itertools.pairwise(edges.tolist())) for edges in ends]
     shifted = any(low or high for cuts in ranges for low, high in cuts)
     return [(hue, saturation) for hue, saturation in itertools.product(*ranges)] if shifted else []
 
 
 def shifted(rgb: Tensor, hue: Tensor | float, saturation: Tensor | float) -> Tensor:
-    """Colours [..., 3] in [0, 1] with ``hue`` (turns) and ``saturation`` added in HSV; differentiable.
+    """Return colours [..., 3] in [0, 1] with ``hue`` (turns) and ``saturation`` added in HSV; differentiable.
 
-    With V and m the largest and least channel, ``S = 1 - m / V`` becomes ``clip(S + saturation, 0, 1)``, that is
-    m becomes ``clip(m - saturation V, 0, V)``; V stays. Grey has hue 0 (red).
+    With V and m the largest and least channel, ``S = 1 - m / V`` becomes ``clip(S + saturation, 0, 1)``, that is m
+    becomes ``clip(m - saturation V, 0, V)``; V stays. Grey has hue 0 (red).
     """
     value, which = rgb.max(dim=-1)
     least = rgb.min(dim=-1).values
@@ -69,10 +69,10 @@ def shifted(rgb: Tensor, hue: Tensor | float, saturation: Tensor | float) -> Ten
 
 @njit(cache=True, error_model="numpy")
 def _hues(low, high):
-    """Bounds of the hue (sixths of a turn) of a box of colours [3]; six apart where it may be any.
+    """Return bounds of the hue (sixths of a turn) of a box of colours [3]; six apart where it may be any.
 
-    Where one channel is the largest (least) all over the box, the hue is monotone in each channel, so its ends are
-    at corners.
+    Where one channel is the largest (least) all over the box, the hue is monotone in each channel, so its ends are at
+    corners.
     """
     first, last = 0.0, 6.0
     for largest in (False, True):
@@ -118,7 +118,7 @@ def shift_box(low, high, hue, saturation, down, up):
 
 @njit(cache=True, error_model="numpy")
 def shifted_bounds(low, high, hue, saturation):
-    """Bounds [n, 3] of `shifted` over boxes of colours [n, 3] and intervals of both shifts."""
+    """Return bounds [n, 3] of `shifted` over boxes of colours [n, 3] and intervals of both shifts."""
     down, up = np.empty_like(low), np.empty_like(high)
     for i in range(low.shape[0]):
         shift_box(low[i], high[i], hue, saturation, down[i], up[i])

@@ -1,7 +1,6 @@
-"""Linear layers of `ns_abstract.methods.nerf.zonotope` on a CPU, compiled: what is off costs nothing (design.md, F4).
+"""Linear layers of `ns_abstract.methods.nerf.zonotope` on a CPU, compiled (docs/dev/design.md, F4).
 
-About half of a field's neurons are off on all of a piece. Each piece's products run over the other rows of the weight
-alone.
+About half of a field's neurons are inactive over a whole sub-box. Its products run over the weight's other rows alone.
 """
 
 from __future__ import annotations
@@ -22,7 +21,7 @@ BLOCK = 36
 
 @njit(cache=True, error_model="numpy")
 def multiply(x, live, weight, rest, out):
-    """``out[r] = sum_i x[r, live[i]] weight[live[i]]`` for ``x`` [R, inputs] and ``live`` [k] of the inputs.
+    """Compute ``out[r] = sum_i x[r, live[i]] weight[live[i]]`` for ``x`` [R, inputs] and ``live`` [k] of the inputs.
 
     ``weight`` is [inputs, n and more, to whole pairs of lines], ``out`` [R, n], ``rest`` [ROWS, two lines] scratch.
     """
@@ -89,7 +88,7 @@ class LayerOutput(NamedTuple):
 
 @njit(cache=True, error_model="numpy")
 def _columns(b, z, first, new, live, weights, scratch, out, place):
-    """Columns of the piece ``b`` behind a layer, from ``place`` on, and their sums.
+    """Compute the columns of the piece ``b`` behind a layer, from ``place`` on, and their sums.
 
     ``first``, ``new``: where its columns, and those of one neuron, begin in ``z``. ``scratch``: [BLOCK, inputs],
     [inputs] and [ROWS, two lines] of the columns' type. Returns where those of the next piece begin, in ``z`` and
@@ -132,7 +131,7 @@ def _columns(b, z, first, new, live, weights, scratch, out, place):
 
 @njit(cache=True, error_model="numpy")
 def _box(b, z, encoded, remainder, live, weights, box):
-    """The ``box`` [n] of the piece ``b`` behind a layer, but for its bias: that before it, and rounding (F4)."""
+    """Compute the ``box`` [n] of piece ``b`` behind a layer, without its bias: propagated box, and rounding (F4)."""
     size, before, spread, n = z.size[b], z.box[b], z.spread[b], box.shape[0]
     rounding, underflow, absolute, seen_absolute = (
         weights.rounding,
@@ -162,12 +161,12 @@ def _box(b, z, encoded, remainder, live, weights, box):
 
 @njit(cache=True, error_model="numpy")
 def linear(z, encoded, remainder, weights, out):
-    """A linear layer, piece by piece (design.md, F4); returns the number of columns behind it.
+    """Compute a linear layer, piece by piece; return the number of columns behind it (design.md, F4).
 
     Args:
         z: `PostActivation` in arrays, columns of the type that they are multiplied in.
         encoded, remainder: [B, m, k] and [B, k] polynomials and remainders of an encoded vector, if the layer sees it.
-        out: `LayerOutput`, filled; its columns and owners may have room for more.
+        out: `LayerOutput`, filled; its columns and owners may be larger.
     """
     inputs, n = weights.absolute.shape
     live_inputs, kind = np.empty(inputs, np.int64), weights.columns.dtype

@@ -12,26 +12,25 @@ from ns_abstract.arithmetic.rounding import FIELD_UP
 
 
 def column_sums(columns: Tensor, owner: Tensor, pieces: int) -> Tensor:
-    """[pieces, n] sums of absolute columns [C, n] by owner [C]."""
+    """Return [pieces, n] sums of absolute columns [C, n] by owner [C]."""
     out = torch.zeros(pieces, columns.shape[1], dtype=columns.dtype, device=columns.device)
     return out.index_add_(0, owner, columns.abs())
 
 
 class PostActivation(NamedTuple):
-    """A batch of B Chebyshev zonotopes behind an activation, the pieces: tensors, or arrays for kernels.
+    """A batch of B Chebyshev zonotopes ("pieces") behind an activation: tensors, or arrays for kernels.
 
     Attributes:
         poly: [B, m, n] Chebyshev coefficients.
-        size: [B, n] sum of the absolute coefficients and error terms. 0: the neuron is off, and only ``box`` and
-            ``spread``, which are 0, say something about it; nothing else of it is looked at.
+        size: [B, n] sum of the absolute coefficients and error terms. 0: the neuron is inactive; then only ``box`` and
+            ``spread``, which are 0, are valid.
         spread: [B, n] sum of the absolute error terms.
         box: [B, n] radius of the rest.
-        slope: [B, n] what the columns of a piece are multiplied by.
+        slope: [B, n] factor of a piece's columns.
         failed: [B] whether the piece was given up: its other values mean nothing.
         count: [B] error terms.
-        columns, owner: [C, n] error terms, not yet multiplied by ``slope``, and the piece [C] that each belongs to,
-            ascending.
-        new_owner, new_neuron, new_size: [N] error terms that move one neuron only, not yet in ``columns``, likewise.
+        columns, owner: [C, n] error terms, not yet multiplied by ``slope``, and the piece [C] of each, ascending.
+        new_owner, new_neuron, new_size: [N] error terms of one neuron each, not yet in ``columns``, likewise.
     """
 
     poly: Any
@@ -48,7 +47,7 @@ class PostActivation(NamedTuple):
     new_size: Any
 
     def select(self, which: Tensor) -> PostActivation:
-        """The pieces ``which`` [k] (indices, ascending)."""
+        """Return the pieces ``which`` [k] (indices, ascending)."""
         place = torch.full_like(self.failed, -1, dtype=torch.int64)
         place[which] = torch.arange(which.numel(), device=which.device)
         owned, new = place[self.owner] >= 0, place[self.new_owner] >= 0
@@ -73,11 +72,11 @@ class PreActivation:
 
     @property
     def radius(self) -> Tensor:
-        """[B, n] columns and box together."""
+        """Sum [B, n] of absolute columns and box."""
         return (self.spread * FIELD_UP + self.box) * FIELD_UP
 
     def without_columns(self, which: Tensor) -> PreActivation:
-        """The pieces ``which`` [k], all but their columns."""
+        """Return the pieces ``which`` [k] without their columns."""
         parts = (self.poly, self.spread, self.box, self.failed, self.count)
         poly, spread, box, failed, count = (part[which] for part in parts)
         return PreActivation(poly, self.columns[:0], self.owner[:0], spread, box, failed, count)

@@ -1,8 +1,7 @@
-"""Load a vanilla NeRF from an ``ns-train vanilla-nerf`` run folder.
+"""Loads a vanilla NeRF from an ``ns-train vanilla-nerf`` run folder.
 
-Nothing from Nerfstudio is imported and no code in the files is run. Numbers and widths of layers are
-those of the checkpoint; the encodings' exponents are Nerfstudio's own, and for runs of abstract-nerf what
-config.yml says.
+It imports nothing from Nerfstudio and runs no code in the files. Numbers and widths of layers are those of the
+checkpoint; the encodings' exponents are Nerfstudio's own, and for runs of abstract-nerf those of config.yml.
 """
 
 from __future__ import annotations
@@ -35,12 +34,12 @@ _PLANES = {"near_plane": 2.0, "far_plane": 6.0}
 
 
 def holds_nerf(run: runs.RunConfig) -> bool:
-    """Whether config.yml names vanilla NeRF: by its method or by its model class."""
+    """Return whether config.yml names vanilla NeRF: by its method or by its model class."""
     return run.method_name in ("vanilla-nerf", "abstract-nerf") or runs.target_class(run) in (_STOCK, _OURS)
 
 
 def load_nerf(run: runs.RunConfig, overrides: Overrides | None = None) -> NerfScene:
-    """Read the fields and what evaluation needs besides."""
+    """Return the fields and the other inputs of Nerfstudio's evaluation."""
     overrides = overrides or Overrides()
     model_state.check_model(run, overrides, (_STOCK, _OURS), "vanilla-nerf", FIX)
     unused = config_keys.check_keys(run, config_keys.VANILLA_NERF)
@@ -73,7 +72,7 @@ def load_nerf(run: runs.RunConfig, overrides: Overrides | None = None) -> NerfSc
 
 
 def _color(run: runs.RunConfig, overrides: Overrides) -> tuple[Assumption, NDArray[np.float32]]:
-    """The record of the background's choice, and its colour."""
+    """Return the record of the background's choice, and its colour."""
     record, color = model_state.background(run, overrides, "white")
     if isinstance(color, str):
         raise InputError(
@@ -86,7 +85,7 @@ def _color(run: runs.RunConfig, overrides: Overrides) -> tuple[Assumption, NDArr
 
 
 def _encodings(run: runs.RunConfig) -> tuple[tuple[float, float], tuple[int | None, int | None]]:
-    """Highest exponents and, where config.yml says them, numbers of the frequencies of positions and directions."""
+    """Return highest exponents, and numbers of frequencies if config.yml states them, of positions and directions."""
     ours = run.method_name == "abstract-nerf" or runs.target_class(run) == _OURS
     if not ours:
         return _EXPONENTS, (None, None)
@@ -113,11 +112,11 @@ def field_weights(
     exponents: tuple[float, float] = _EXPONENTS,
     counts: tuple[int | None, int | None] = (None, None),
 ) -> FieldWeights:
-    """One field of a model's state.
+    """Return one field of a model's state.
 
     Args:
         exponents: Highest exponents of the frequencies of positions and directions; the lowest are 0.
-        counts: Numbers of these frequencies; None: what the layers' widths say.
+        counts: Numbers of these frequencies; None: as the layers' widths imply.
     """
 
     def layer(key: str, skip: bool = False) -> Layer:

@@ -1,4 +1,4 @@
-"""Vanilla-NeRF runs as the command lines see them; see `ns_abstract.refine.protocol.Method`."""
+"""Vanilla-NeRF runs as a method for commands and the Python API; see `ns_abstract.refine.protocol.Method`."""
 
 from __future__ import annotations
 
@@ -113,7 +113,7 @@ class NerfMethod(FieldMethod):
         return f"vanilla NeRF, {self.scene.fine.text}"
 
     def frame(self, poses: PoseBox, sheared: bool = False, layers: bool = False) -> NerfFrame:
-        """One frame, ready for refinement; its cells are never ``sheared``."""
+        """Return one frame; its cells are never ``sheared``."""
         refuse_layers(layers)
         return NerfFrame(self.scene, self.sampling, poses, self.device, self._processes(poses.geometry.box.dimensions))
 
@@ -123,7 +123,7 @@ class NerfMethod(FieldMethod):
         return NerfWeightFrame(self.scene, self.sampling, poses, planes, pixels, self.device, workers)
 
     def _processes(self, dimensions: int) -> int:
-        """Processes that bound rays of a set with so many parameters."""
+        """Return the number of processes that bound rays of a set with ``dimensions`` parameters."""
         if self.device == "cpu":
             return self.workers
         field, swept = self.scene.fine, self.sampling.kind == "hierarchical"
@@ -180,15 +180,15 @@ class NerfMethod(FieldMethod):
         }
 
     def differentiable(self, poses: PoseBox) -> Callable[[torch.Tensor], torch.Tensor]:
-        """Parameter values [d] to the picture [H, W, 3], by the concrete renderer."""
+        """Return the renderer, from parameter values [d] to the picture [H, W, 3]."""
         return picture_of_parameters(poses, NerfRenderer(self.scene, self.sampling).picture)
 
 
 def white_samples(planes: Sequence[WeightPlane], sampling: Sampling) -> WhiteSamples:
-    """Return which samples the planes choose.
+    """Return the samples that the planes select.
 
     Raises:
-        InputError: A selection is one of Gaussians, or the samples' places depend on the picture.
+        InputError: A selection is one of Gaussians, or the samples' positions depend on the picture.
     """
     if sampling.kind != "uniform":
         raise InputError(
@@ -209,10 +209,10 @@ def white_samples(planes: Sequence[WeightPlane], sampling: Sampling) -> WhiteSam
 
 
 class NerfWeightFrame(NerfFrame):
-    """A NeRF's frame of weights. Shifts of colours change none.
+    """A NeRF's frame of blending weights, which shifts of colours do not change.
 
-    ``scene``, ``sampling``, ``pose_set``, ``device``, ``workers``: as `NerfFrame` takes them. ``pixels``: [H, W] the
-    rays that are read; nothing is said of others. Raises InputError: see `white_samples`.
+    ``scene``, ``sampling``, ``pose_set``, ``device``, ``workers``: as in `NerfFrame`. ``pixels``: [H, W] the rays that
+    are read; others have no meaningful bounds. Raises InputError: see `white_samples`.
     """
 
     def __init__(

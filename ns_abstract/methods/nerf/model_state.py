@@ -1,4 +1,4 @@
-"""What the loaders of both kinds of fields share: the model's class, its tensors, its background, and its records."""
+"""The common parts of the loaders of both kinds of fields: model class, tensors, background, and records."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ _SPLATS = ("rasterize_mode", "assume_splatfacto", "drop_nan_gaussians")
 
 
 class ModelState(dict[str, Any]):
-    """A model's state in a checkpoint, which remembers which tensors were read; ``fix``: what to give in its place."""
+    """A model's state in a checkpoint, which records the tensors that were read; ``fix``: advice for its errors."""
 
     def __init__(self, state: Mapping[str, Any], checkpoint: Path, fix: str) -> None:
         super().__init__(state)
@@ -46,11 +46,11 @@ class ModelState(dict[str, Any]):
         return super().__getitem__(key)
 
     def refused(self, problem: str, key: str, fix: str | None = None) -> InputError:
-        """The error of what the state holds as ``key``."""
+        """Return the error of the tensor ``key``."""
         return InputError(problem, file=self.checkpoint, field=_name(key), fix=fix or self.fix)
 
     def refuse_unread(self, method: str) -> None:
-        """Raise InputError that names the tensors that were not read and may draw something."""
+        """Raise InputError that names the tensors that were not read and may change the picture."""
         unknown = sorted(key for key in self if key not in self.read and not key.startswith(tuple(_IDLE)))
         if unknown:
             more = f" and {len(unknown) - _SHOWN} more" if len(unknown) > _SHOWN else ""
@@ -62,13 +62,13 @@ class ModelState(dict[str, Any]):
             )
 
     def float32(self, key: str) -> NDArray[np.float32]:
-        """A tensor that has to be there."""
+        """Return a tensor, which must be there."""
         if key not in self:
             raise self.refused("missing", key)
         return to_float32(self[key], self.checkpoint, _name(key))
 
     def linear(self, key: str) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-        """Weight [out, in] and bias [out] of a linear layer."""
+        """Return weight [out, in] and bias [out] of a linear layer."""
         weight, bias = self.float32(f"{key}.weight"), self.float32(f"{key}.bias")
         if weight.ndim != 2 or 0 in weight.shape or bias.shape != weight.shape[:1]:
             raise self.refused(
@@ -95,9 +95,9 @@ def check_model(run: runs.RunConfig, overrides: Overrides, classes: Sequence[str
 
 
 def background(run: runs.RunConfig, overrides: Overrides, default: str) -> tuple[Assumption, NDArray[np.float32] | str]:
-    """The record of the background's choice, and its colour [3] or `LAST_SAMPLE`.
+    """Return the record of the background's choice, and its colour [3] or `LAST_SAMPLE`.
 
-    ``run``: its ``background_color`` is read. ``overrides``: ``background`` takes its place. Raises InputError: no such
+    ``run``: its ``background_color`` is read. ``overrides``: its ``background`` comes first. Raises InputError: no such
     background.
     """
     named, origin = "background_color" in run.model, "config.yml: pipeline.model.background_color"
@@ -122,7 +122,7 @@ def records(
     transform: DataparserTransform,
     assumed_units: bool,
 ) -> tuple[Assumption, ...]:
-    """Which step, class, modules and units are taken, and where each choice came from.
+    """Return records of the step, class, modules and units, and where each choice came from.
 
     Args:
         stock: Nerfstudio's own class, where config.yml names none.

@@ -1,6 +1,6 @@
-"""Load a nerfacto from an ``ns-train nerfacto`` run folder, where it was trained with torch's implementation.
+"""Loads a nerfacto from an ``ns-train nerfacto`` run folder, if it was trained with torch's implementation.
 
-Nothing from Nerfstudio is imported and no code in the files is run. Sizes that config.yml and the checkpoint both say
+It imports nothing from Nerfstudio and runs no code in the files. Sizes that both config.yml and the checkpoint state
 have to agree; the grids' resolutions, the samples and the factor of densities are in config.yml alone.
 """
 
@@ -66,7 +66,7 @@ _CLOSE_ULPS = 4.0
 
 @dataclass(frozen=True)
 class _Grid:
-    """What config.yml says of a hash grid."""
+    """The sizes of a hash grid in config.yml."""
 
     levels: int
     coarsest: int
@@ -80,12 +80,12 @@ class _Grid:
 
 
 def holds_nerfacto(run: runs.RunConfig) -> bool:
-    """Whether config.yml names nerfacto: by its method or by its model class."""
+    """Return whether config.yml names nerfacto: by its method or by its model class."""
     return run.method_name in ("nerfacto", "abstract-nerfacto") or runs.target_class(run) == _STOCK
 
 
 def load_nerfacto(run: runs.RunConfig, overrides: Overrides | None = None) -> NerfactoScene:
-    """Read the fields and what evaluation needs besides."""
+    """Return the fields and the other inputs of Nerfstudio's evaluation."""
     overrides = overrides or Overrides()
     model_state.check_model(run, overrides, (_STOCK,), "nerfacto", _FIX)
     unused = config_keys.check_keys(run, config_keys.NERFACTO)
@@ -140,7 +140,7 @@ def load_nerfacto(run: runs.RunConfig, overrides: Overrides | None = None) -> Ne
 
 
 def resolutions(levels: int, coarsest: int, finest: int) -> NDArray[np.int64]:
-    """[levels] resolutions of a hash grid from ``coarsest`` to ``finest``, as torch rounds them in float32.
+    """Return [levels] resolutions of a hash grid from ``coarsest`` to ``finest``, as torch rounds them in float32.
 
     A checkpoint does not hold them (nerfstudio/field_components/encodings.py, ``HashEncoding.__init__``).
     """
@@ -155,14 +155,14 @@ def _growth(levels: int, coarsest: int, finest: int) -> float:
 
 
 def _resolution_record(field: NerfactoField) -> Assumption:
-    """The resolutions of all grids."""
+    """Return the record of the resolutions of all grids."""
     encodings = field.encoding, *(one.encoding for one in field.proposals)
     sizes = "; ".join(" ".join(map(str, one.resolutions.tolist())) for one in encodings)
     return Assumption("resolutions", sizes, "config.yml, as torch rounds them in float32: field, then proposals")
 
 
 def _close_resolutions(grids: list[_Grid]) -> tuple[str, ...]:
-    """A note on the resolutions that another machine's float32 power might round to another integer."""
+    """Return a note on resolutions that another machine's float32 power might round to another integer."""
     close = []
     for one in dict.fromkeys((grid.levels, grid.coarsest, grid.finest) for grid in grids):
         for level, size in enumerate(resolutions(*one)):
@@ -181,7 +181,7 @@ def _close_resolutions(grids: list[_Grid]) -> tuple[str, ...]:
 def _refuse_other_implementation(run: runs.RunConfig, state: ModelState) -> None:
     """Refuse checkpoints of tiny-cuda-nn, and those that hold no nerfacto at all.
 
-    What config.yml says does not decide: without tiny-cuda-nn installed, "tcnn" trains torch's implementation.
+    config.yml does not decide: without tiny-cuda-nn installed, "tcnn" trains torch's implementation.
     """
     if any(key.endswith(".params") for key in state):
         raise InputError(
@@ -217,7 +217,7 @@ def _proposal_grid(arguments: Mapping[str, int]) -> _Grid:
 
 
 def _samples(run: runs.RunConfig) -> tuple[int, ...]:
-    """Samples of every round, and of the picture."""
+    """Return the numbers of samples of every round, and of the picture."""
     rounds = run.integer("num_proposal_iterations", 2, 1, _ROUNDS_LIMIT)
     value: Any = run.model.get("num_proposal_samples_per_ray", (256, 96))
     fits = isinstance(value, (list, tuple)) and all(type(one) is int and 1 <= one <= _SAMPLES_LIMIT for one in value)
@@ -228,7 +228,7 @@ def _samples(run: runs.RunConfig) -> tuple[int, ...]:
 
 
 def _proposal_arguments(run: runs.RunConfig) -> list[dict[str, int]]:
-    """The arguments of every proposal field there is (nerfstudio/models/nerfacto.py:182-205)."""
+    """Return the arguments of every proposal field (nerfstudio/models/nerfacto.py:182-205)."""
     name = _MODEL + "proposal_net_args_list"
     value: Any = run.model.get("proposal_net_args_list", _PROPOSALS)
     entries = [runs.as_mapping(one) for one in value] if isinstance(value, (list, tuple)) else []
@@ -268,7 +268,7 @@ def _argument(section: runs.RunConfig, name: str, key: str) -> int:
 def _proposals(
     run: runs.RunConfig, state: ModelState, arguments: list[dict[str, int]], factor: float
 ) -> tuple[ProposalField, ...]:
-    """The field of every round."""
+    """Return the field of every round."""
     fields = []
     for i, one in enumerate(arguments):
         name, grid = f"proposal_networks.{i}", _proposal_grid(one)
@@ -282,7 +282,7 @@ def _proposals(
 
 
 def _encoding(state: ModelState, owner: str, key: str, grid: _Grid) -> HashEncoding:
-    """The hash grid ``owner.key``, whose sizes are those of config.yml."""
+    """Return the hash grid ``owner.key``, whose sizes are those of config.yml."""
     for buffer, said in (("num_levels", grid.levels), ("max_res", grid.finest), ("log2_hashmap_size", grid.log2_size)):
         name = f"{owner}.{buffer}"
         if name in state and (stored := _whole(state[name])) != said:
@@ -300,7 +300,7 @@ def _encoding(state: ModelState, owner: str, key: str, grid: _Grid) -> HashEncod
 
 
 def _whole(value: Any) -> Any:
-    """The number that a tensor of one integer holds; what it is otherwise."""
+    """Return the number in a tensor of one integer; any other value as it is."""
     if isinstance(value, StoredTensor) and value.kind == "int64" and value.storage is not None and value.shape == ():
         return int(value.storage[value.offset])
     return show(value) if not isinstance(value, np.ndarray) else value.item()
@@ -315,7 +315,7 @@ def _refuse_second_table(state: ModelState, key: str, encoding: HashEncoding) ->
 
 
 def _net(state: ModelState, key: str, widths: tuple[int, ...]) -> DenseNet:
-    """The network ``key`` with layers of the widths that config.yml says."""
+    """Return the network ``key`` with layers of the widths in config.yml."""
     weights, biases = [], []
     for i, shape in enumerate(zip(widths[1:], widths[:-1], strict=True)):
         weight, bias = state.linear(f"{key}.layers.{i}")
@@ -328,7 +328,7 @@ def _net(state: ModelState, key: str, widths: tuple[int, ...]) -> DenseNet:
 
 
 def _color_net(run: runs.RunConfig, state: ModelState) -> DenseNet:
-    """The network of colours, the appearance embedding as a part of its first bias."""
+    """Return the network of colours, with the appearance embedding in its first bias."""
     use, average = (run.flag(f"use_{kind}appearance_embedding", True) for kind in ("", "average_"))
     length = run.integer("appearance_embed_dim", 32, 0, _WIDTH_LIMIT) if use else 0
     width = run.integer("hidden_dim_color", 64, 1, _WIDTH_LIMIT)
@@ -348,7 +348,7 @@ def _color_net(run: runs.RunConfig, state: ModelState) -> DenseNet:
 
 
 def with_mean(bias: NDArray[np.float64], weight: NDArray[np.float64], rows: NDArray[np.float32]) -> NDArray[np.float64]:
-    """``bias + weight @ rows.mean(axis=0)`` [out], the exact values rounded once.
+    """Return ``bias + weight @ rows.mean(axis=0)`` [out], the exact values rounded once.
 
     Args:
         bias, weight: [out] and [out, n], values of float32.

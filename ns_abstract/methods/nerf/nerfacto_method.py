@@ -1,4 +1,4 @@
-"""Nerfacto runs as the command lines see them; see `ns_abstract.refine.protocol.Method`."""
+"""Nerfacto runs as a method for commands and the Python API; see `ns_abstract.refine.protocol.Method`."""
 
 from __future__ import annotations
 
@@ -79,7 +79,7 @@ class NerfactoMethod(FieldMethod):
         return f"nerfacto, {self.scene.field.text}"
 
     def frame(self, poses: PoseBox, sheared: bool = False, layers: bool = False) -> NerfactoFrame:
-        """One frame. Raises InputError: layers are asked for: a NeRF's depth is a median."""
+        """Return one frame. Raises InputError: layers are requested: a NeRF's depth is a median."""
         refuse_layers(layers)
         return NerfactoFrame(self.scene, poses, self.workers)
 

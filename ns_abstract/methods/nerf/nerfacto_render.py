@@ -16,14 +16,14 @@ from ns_abstract.methods.nerf.render import HISTOGRAM_PADDING, RayRenderer, Shif
 
 
 def contracted(x: Tensor) -> Tensor:
-    """The grids' coordinates [..., 3] of points [..., 3] (spatial_distortions.py:66-69, nerfacto_field.py:208)."""
+    """Return the grids' coordinates [..., 3] of points (spatial_distortions.py:66-69, nerfacto_field.py:208)."""
     size = x.abs().amax(dim=-1, keepdim=True)
     far = size.clamp(min=1.0)
     return (torch.where(size < 1.0, x, (2.0 - 1.0 / far) * (x / far)) + 2.0) / 4.0
 
 
 def grid_features(encoding: HashEncoding, x: Tensor) -> Tensor:
-    """Features [..., L F] of positions [..., 3] in [0, 1]^3 (encodings.py:418-459)."""
+    """Return features [..., L F] of positions [..., 3] in [0, 1]^3 (encodings.py:418-459)."""
     levels, rows, _ = encoding.table.shape
     q = x[..., None, :] * torch.from_numpy(encoding.resolutions)[:, None]
     low = torch.floor(q).detach()
@@ -38,14 +38,14 @@ def grid_features(encoding: HashEncoding, x: Tensor) -> Tensor:
 
 
 def evaluate_net(net: DenseNet, x: Tensor) -> Tensor:
-    """Outputs of a network."""
+    """Return the outputs of a network."""
     for k, (weight, bias) in enumerate(zip(net.weights, net.biases, strict=True)):
         x = functional.linear(functional.relu(x) if k else x, torch.from_numpy(weight), torch.from_numpy(bias))
     return x
 
 
 def harmonics(direction: Tensor) -> Tensor:
-    """The 16 harmonics [..., 16] of (d + 1) / 2 for unit directions [..., 3] (nerfacto_field.py:242, math.py:42-77)."""
+    """Return 16 harmonics [..., 16] of (d + 1) / 2 for unit directions (nerfacto_field.py:242, math.py:42-77)."""
     x, y, z = ((direction + 1.0) / 2.0).unbind(dim=-1)
     xx, yy, zz = x * x, y * y, z * z
     parts = [
@@ -62,18 +62,18 @@ def harmonics(direction: Tensor) -> Tensor:
 
 
 def even(end: float, count: int) -> Tensor:
-    """[count] float64 numbers from 0 to ``end``."""
+    """Return [count] evenly spaced float64 numbers from 0 to ``end``."""
     return torch.linspace(0.0, end, count, dtype=torch.float64)
 
 
 def quantiles(count: int) -> Tensor:
-    """[count + 1] parts of a distribution at which the edges of ``count`` intervals lie (ray_samplers.py:337-339)."""
+    """Return the [count + 1] quantiles at which the edges of ``count`` intervals lie (ray_samplers.py:337-339)."""
     edges = count + 1
     return even(1.0 - 1.0 / edges, edges) + 1.0 / (2 * edges)
 
 
 def next_places(places: Tensor, weights: Tensor, count: int) -> Tensor:
-    """Places [n, count + 1] of the next round's edges (ray_samplers.py:305-354, outside training).
+    """Return positions [n, count + 1] of the next round's edges (ray_samplers.py:305-354, outside training).
 
     ``places`` [n, k + 1] are the edges of this round, from 0 to 1, and ``weights`` [n, k] those of its intervals.
     """
@@ -89,12 +89,12 @@ def next_places(places: Tensor, weights: Tensor, count: int) -> Tensor:
 
 
 def spacing(distance: float) -> float:
-    """Place of a distance in the piecewise spacing: half of it below 1, above it 1 - 1 / (2 distance)."""
+    """Return the position of a distance in the piecewise spacing: half of it below 1, above it 1 - 1 / (2 distance)."""
     return distance / 2.0 if distance < 1.0 else 1.0 - 1.0 / (2.0 * distance)
 
 
 class NerfactoRenderer(RayRenderer):
-    """Renders rays of a nerfacto; slopes go through the samples' places as well."""
+    """Renders rays of a nerfacto; gradients flow through the samples' positions, too."""
 
     def __init__(self, field: NerfactoField) -> None:
         self.field = field
@@ -108,7 +108,7 @@ class NerfactoRenderer(RayRenderer):
         return self.colors(pose[:, 3], world, shift)
 
     def colors(self, origin: Tensor, world: Tensor, shift: Shift | None = None) -> Tensor:
-        """`rays` from ``origin`` [3], or [n, 3] of every ray, along unit vectors ``world`` [n, 3]."""
+        """Return `rays` from ``origin`` [3], or [n, 3] by ray, along unit vectors ``world`` [n, 3]."""
         f = self.field
         weights, raw = self._samples(
             f.encoding, f.density_net, f.average_init_density, origin, world, self.edges(origin, world)
@@ -127,7 +127,7 @@ class NerfactoRenderer(RayRenderer):
         return total.clamp(0.0, 1.0)
 
     def edges(self, origin: Tensor, world: Tensor) -> Tensor:
-        """[n, samples + 1] distances between which the picture's samples lie; rays as of `colors`."""
+        """Return [n, samples + 1] distances of the edges of the picture's samples; rays as in `colors`."""
         samples = self.field.samples
         places = even(1.0, samples[0] + 1).expand(len(world), -1)
         for field, count in zip(self.field.proposals, samples[1:], strict=True):
@@ -137,7 +137,7 @@ class NerfactoRenderer(RayRenderer):
         return self.distances(places)
 
     def distances(self, places: Tensor) -> Tensor:
-        """Distances of places in [0, 1] along a ray (ray_samplers.py:113-118, 244-245)."""
+        """Return distances of positions in [0, 1] along a ray (ray_samplers.py:113-118, 244-245)."""
         f, piecewise = self.field, self.field.spacing == "piecewise"
         near, far = (spacing(end) if piecewise else end for end in (f.near, f.far))
         places = places * far + (1.0 - places) * near
@@ -149,7 +149,7 @@ class NerfactoRenderer(RayRenderer):
     def _samples(
         encoding: HashEncoding, net: DenseNet, factor: float, origin: Tensor, world: Tensor, distances: Tensor
     ) -> tuple[Tensor, Tensor]:
-        """Weights [n, k] of intervals between ``distances`` [n, k + 1], and the network's outputs in their middles."""
+        """Return weights [n, k] of intervals between ``distances`` [n, k + 1], and the network's outputs there."""
         middles = (distances[:, :-1] + distances[:, 1:]) / 2.0
         x = contracted(origin[..., None, :] + world[:, None] * middles[..., None])
         # nerfacto_field.py:211-213: false only where rounding puts a point that is very far away onto the cube's face

@@ -1,7 +1,7 @@
-"""A declared occupancy grid: a part of a scene that says where its density is 0 (design.md, F11).
+"""A declared occupancy grid, which states where a scene's density is 0 (docs/dev/design.md, F11).
 
-The scene with the grid is another one than the scene without: where a voxel is empty, or outside the grid, density
-is 0 whatever the networks say. Renderer, attacks and bounds all take the same definition.
+The scene with the grid is another one than the scene without: in empty voxels and outside the grid, density is 0
+whatever the networks compute. Renderer, attacks and bounds all use the same definition.
 """
 
 from __future__ import annotations
@@ -47,11 +47,11 @@ class OccupancyGrid:
 
     @staticmethod
     def of_box(lower: np.ndarray, upper: np.ndarray, occupied: np.ndarray) -> OccupancyGrid:
-        """The grid whose voxels fill the box from ``lower`` to ``upper`` [3] float64."""
+        """Return the grid whose voxels fill the box from ``lower`` to ``upper`` [3] float64."""
         return OccupancyGrid(lower, np.array(occupied.shape) / (upper - lower), occupied)
 
     def at(self, points: Tensor) -> Tensor:
-        """[...] whether ``points`` [..., 3] lie in occupied voxels; False outside and where not finite."""
+        """Return [...] whether ``points`` [..., 3] lie in occupied voxels; False outside and where not finite."""
         size = torch.tensor(self.occupied.shape, dtype=torch.float64, device=points.device)
         lower, scale = (torch.from_numpy(v).to(points.device) for v in (self.lower, self.scale))
         place = torch.floor((points.detach().double() - lower) * scale)
@@ -73,9 +73,9 @@ class OccupancyGrid:
         return sums
 
     def look(self, lower: np.ndarray, upper: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """[k] whether boxes [k, 3] of points surely lie in empty voxels, and whether surely in occupied ones.
+        """Return [k] whether boxes [k, 3] of points surely lie in empty voxels, and whether surely in occupied ones.
 
-        Encloses the float64 rounding of `at`. Boxes that are not finite are neither, unless the grid is empty.
+        It encloses the float64 rounding of `at`. Boxes that are not finite are neither, unless the grid is empty.
         """
         size = np.array(self.occupied.shape)
         with np.errstate(invalid="ignore", over="ignore"):
@@ -99,12 +99,12 @@ class OccupancyGrid:
 
     @property
     def digest(self) -> bytes:
-        """Tells grids apart."""
+        """Return bytes that differ for different grids."""
         parts = (np.array(self.occupied.shape), self.lower, self.scale, np.packbits(self.occupied))
         return hashlib.sha256(b"".join(part.tobytes() for part in parts)).digest()
 
     def describe(self) -> str:
-        """The grid in a few words."""
+        """Return the grid as text."""
         share = 100.0 * float(self.occupied.mean())
         return f"{'x'.join(str(n) for n in self.occupied.shape)} voxels, {share:.2g} % occupied"
 
@@ -116,7 +116,7 @@ class OccupancyGrid:
 
 
 def load_grid(path: Path) -> OccupancyGrid:
-    """Read a grid from an npz with ``occupied`` [X, Y, Z] bool and ``aabb`` [2, 3] (normalised units)."""
+    """Return a grid from an npz with ``occupied`` [X, Y, Z] bool and ``aabb`` [2, 3] (normalised units)."""
     with open_archive(path, "occupancy grid", "give an .npz with occupied and aabb") as file:
         for name in ("occupied", "aabb"):
             if name not in file.declared:
@@ -146,9 +146,9 @@ def sample_grid(
     least_density: float,
     progress: Callable[[float], None] = lambda share: None,
 ) -> OccupancyGrid:
-    """A grid of the voxels near which ``density`` (points [n, 3] float64 to [n]) exceeds ``least_density``.
+    """Return a grid of the voxels near which ``density`` (points [n, 3] float64 to [n]) exceeds ``least_density``.
 
-    Eight points of every voxel are sampled and the voxels found grow by one on every side: a proposal, not a proof.
+    Eight points of every voxel are sampled, and occupied voxels grow by one to every side: a proposal, not a proof.
     """
     low, high = np.array(lower, np.float64), np.array(upper, np.float64)
     size = (high - low) / resolution

@@ -16,13 +16,13 @@ from ns_abstract.methods.nerf.layer_polynomials import PreActivation
 
 
 def greatest(value: PreActivation) -> Tensor:
-    """Upper bounds [B, n] of an affine batch on whole cells."""
+    """Return upper bounds [B, n] of an affine batch on whole cells."""
     middle, spread = value.poly[:, 0], value.poly[:, 1:].abs().sum(dim=1)
     return middle + spread + (value.radius + CHEBYSHEV_ROUNDING * (middle.abs() + spread))
 
 
 def bounds_by_part(value: PreActivation, bernstein: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-    """Bounds [B, parts, n] of an affine batch on every part of its cell, and its radius [B, n]."""
+    """Return bounds [B, parts, n] of an affine batch on every part of its cell, and its radius [B, n]."""
     error = value.radius
     (batch, m, n), (parts, k, _) = value.poly.shape, bernstein.shape
     # pieces and outputs side by side
@@ -39,7 +39,7 @@ def bounds_by_part(value: PreActivation, bernstein: Tensor) -> tuple[Tensor, Ten
 
 
 def density(z: Tensor, *, up: bool) -> Tensor:
-    """A bound of ``softplus(z)``, from above or below (design.md, F7).
+    """Return a bound of ``softplus(z)``, from above or below (design.md, F7).
 
     torch returns z itself for the softplus of z > 20, which is less than the function by 2.1e-9.
     """
@@ -50,7 +50,7 @@ def density(z: Tensor, *, up: bool) -> Tensor:
 
 
 def opacity(z: Tensor, length: Tensor, *, up: bool) -> Tensor:
-    """A bound of ``1 - exp(-length softplus(z))``, from above or below (design.md, F7)."""
+    """Return a bound of ``1 - exp(-length softplus(z))``, from above or below (design.md, F7)."""
     alpha = -torch.expm1(-length * density(z, up=up))
     if up:
         return (alpha * (1.0 + ACTIVATION_ROUNDING) + ACTIVATION_FLOOR).clamp(max=1.0)
@@ -58,7 +58,7 @@ def opacity(z: Tensor, length: Tensor, *, up: bool) -> Tensor:
 
 
 def brightness(value: PreActivation, bernstein: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-    """Bounds [B, parts, n] of the sigmoid on every part, [0, 1] for pieces that were given up, and radii [B, n]."""
+    """Return bounds [B, parts, n] of the sigmoid on every part, [0, 1] for failed pieces, and radii [B, n]."""
     low, high, error = bounds_by_part(value, bernstein)
     bad = value.failed[:, None, None]
     low = torch.where(bad, 0.0, torch.sigmoid(low) * (1.0 - COMPOSITE_ROUNDING))

@@ -21,7 +21,7 @@ _GOLDEN = 0.5 * (5.0**0.5 - 1.0)
 
 
 def unite_parts(low: np.ndarray, high: np.ndarray, ends: list[Float64Array]) -> tuple[np.ndarray, np.ndarray, list]:
-    """Parts [n, K_1, ..., K_d, 3] with edges ``ends`` [K_j + 1], at most `MOST_PARTS` by axis: neighbours united."""
+    """Return parts [n, K_1, ..., K_d, 3] with edges ``ends`` [K_j + 1], neighbours united to `MOST_PARTS` by axis."""
     for axis, edges in enumerate(ends):
         count = len(edges) - 1
         if count <= MOST_PARTS:
@@ -36,19 +36,19 @@ def unite_parts(low: np.ndarray, high: np.ndarray, ends: list[Float64Array]) -> 
 def fit_planes(
     low: np.ndarray, high: np.ndarray, ends: Sequence[Float64Array], slack: Sequence[float] = ()
 ) -> LinearSets:
-    """Planes below ``low`` and above ``high`` on every part, and so on their union (design.md, F12).
+    """Return planes below ``low`` and above ``high`` on every part, and so on their union (design.md, F12).
 
-    The plane ``a p + b`` lies above the parts with middles c and half-widths h where
-    ``b >= max_k(high_k - a c_k + |a| h_k)``; the right side is convex in a, and the plane's mean over the cell. It is
-    made small axis by axis. Whatever the slopes are, the offset is right.
+    The plane ``a p + b`` lies above the parts with middles c and half-widths h where ``b >= max_k(high_k - a c_k + |a|
+    h_k)``. The right side, the plane's mean over the cell, is convex in a. It is minimised axis by axis. The offset is
+    sound for any slopes.
 
     Args:
         low, high: [n, K_1, ..., K_d, 3] bounds by part.
         ends: [K_j + 1] edges of the parts along each axis, from -1 to 1.
-        slack: [d] what every part is wider on each side; nothing where it is left out.
+        slack: [d] by which every part is wider on each side; none where it is left out.
 
     Returns:
-        A_lower [n, 3, d], b_lower [n, 3], A_upper, b_upper, float32. They also hold what is rounded to float32.
+        A_lower [n, 3, d], b_lower [n, 3], A_upper, b_upper, float32, rounded outward.
     """
     n, d = low.shape[0], len(ends)
     low, high, ends = unite_parts(low, high, list(ends))
@@ -76,12 +76,12 @@ def fit_planes(
 
 
 def _offset(rows: Float64Array, slope: Float64Array, centre: Float64Array, half: Float64Array) -> Float64Array:
-    """[r] least offsets such that planes of ``slope`` [r, d] lie above ``rows`` [r, parts]."""
+    """Return [r] least offsets such that planes of ``slope`` [r, d] lie above ``rows`` [r, parts]."""
     return (rows - slope @ centre.T + np.abs(slope) @ half.T).max(axis=1)
 
 
 def _slopes(rows: Float64Array, centre: Float64Array, half: Float64Array) -> Float64Array:
-    """[r, d] slopes of planes above ``rows`` [r, parts] whose offsets are small."""
+    """Return [r, d] slopes of planes above ``rows`` [r, parts] whose offsets are small."""
     d = centre.shape[1]
     slope = np.zeros((len(rows), d))
     for _ in range(1 if d == 1 else _ROUNDS):
@@ -100,7 +100,7 @@ def _slopes(rows: Float64Array, centre: Float64Array, half: Float64Array) -> Flo
 
 
 def _least(offset, reach: Float64Array, least_known: Float64Array) -> Float64Array:
-    """Where the convex ``offset`` is about least on [-reach, reach]; no worse than at ``least_known`` and at 0."""
+    """Return a point of [-reach, reach] where the convex ``offset`` is nearly least, no worse than two known ones."""
     low, high = -reach, reach.copy()
     inner = [high - _GOLDEN * (high - low), low + _GOLDEN * (high - low)]
     values = [offset(place) for place in inner]

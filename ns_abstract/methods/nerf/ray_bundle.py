@@ -15,10 +15,10 @@ TAYLOR = 6
 
 
 class RayBundle:
-    """The rays of some pixels over one box of poses, as polynomials of the pose (design.md, F10).
+    """The rays of some pixels over one box of poses, as polynomials of the pose (docs/dev/design.md, F10).
 
     Args:
-        swept: Whether samples lie anywhere in their bins; the last parameter is the place there.
+        swept: Whether samples lie anywhere in their bins; the last parameter is then the position in the bin.
     """
 
     def __init__(
@@ -47,19 +47,22 @@ class RayBundle:
 
     @property
     def finite(self) -> bool:
-        """Whether the directions are known at all."""
+        """Whether the directions have finite bounds."""
         return bool(np.isfinite(self.direction).all() and np.isfinite(self.direction_radius).all())
 
     @property
     def rounded(self) -> tuple[np.ndarray, np.ndarray]:
-        """Radii [3] of the origin and [n, 3] of directions, with the rounding of points, here and in a render."""
+        """Return radii [3] of the origin and [n, 3] of directions, with points' rounding, here and in a render."""
         return (
             self.origin_radius + FOLLOWED_ROUNDING * np.abs(self.origin).sum(axis=0),
             self.direction_radius + FOLLOWED_ROUNDING * np.abs(self.direction).sum(axis=1),
         )
 
     def points(self, ray: np.ndarray, distance: np.ndarray, half: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Polynomials [k, M, 3] and radii [k, 3] of points at ``distance`` [k] on ``ray`` [k], ``half`` [k] swept."""
+        """Return polynomials [k, M, 3] and radii [k, 3] of points at ``distance`` [k] on ``ray`` [k].
+
+        ``half`` [k]: half of the swept length.
+        """
         lines = self.origin + distance[:, None, None] * self.direction[ray]
         far = distance
         if self.swept:
@@ -73,7 +76,7 @@ class RayBundle:
     def ranges(
         self, lines: np.ndarray, radius: np.ndarray, low: np.ndarray, high: np.ndarray
     ) -> tuple[np.ndarray, np.ndarray]:
-        """Bounds [k, 3] of the ``points`` (lines, radius) on boxes from ``low`` to ``high`` [k, d] in [-1, 1]."""
+        """Return bounds [k, 3] of ``points`` (lines, radius) on boxes from ``low`` to ``high`` [k, d] in [-1, 1]."""
         middle, half = 0.5 * (low + high), 0.5 * (high - low)
         there = np.prod(middle[:, None, :] ** self.exponents, axis=-1)
         center = (there[..., None] * lines).sum(axis=1)
@@ -84,7 +87,7 @@ class RayBundle:
         return center - spread, center + spread
 
     def displacement(self, distances: np.ndarray, lengths: np.ndarray) -> np.ndarray:
-        """[n, samples, d] half of what a sample moves by over each parameter's range, about."""
+        """Return the approximate half [n, samples, d] of a sample's motion over each parameter's range."""
         displacement = np.zeros((self.direction.shape[0], distances.size, self.exponents.shape[1]))
         for j in range(self.exponents.shape[1]):
             moving = self.exponents[:, j] > 0

@@ -1,4 +1,4 @@
-"""Records of bounds of rays, and the field of a scene along the rays of a sampling (design.md, F6-F8)."""
+"""Records of bounds of rays, and a scene's field along the rays of a sampling (docs/dev/design.md, F6-F8)."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ _VALUES, _ARRAYS = 1 << 25, 12
 
 @dataclass(frozen=True)
 class RayTuning:
-    """Light and ways from which on samples are worked on. None of them decides whether a bound holds."""
+    """From which light and motion on samples are refined; soundness does not depend on it."""
 
     #: Light (in [0, 1]) that a skipped sample may add, as a share of the tolerance.
     quiet: float = 0.02
@@ -59,7 +59,7 @@ Shifts = tuple[Range, Range]
 
 
 def basis_of(dimensions: int, field: FieldWeights) -> ChebyshevBasis:
-    """The polynomials that are used for ``dimensions`` parameters of a ``field``."""
+    """Return the polynomials for ``dimensions`` parameters of a ``field``."""
     degree, grid = _DEGREES.get(dimensions, (1, 2))
     if dimensions == 1 and len(field.base) <= _SHALLOW:
         degree, grid = _SHALLOW_DEGREE
@@ -67,12 +67,12 @@ def basis_of(dimensions: int, field: FieldWeights) -> ChebyshevBasis:
 
 
 def cells_at_once(field: FieldWeights, basis: ChebyshevBasis) -> int:
-    """Cells of a batch where kernels are not compiled."""
+    """Return the number of cells of a batch where kernels are not compiled."""
     return max(1, _VALUES // (len(basis.evaluation) * field.width))
 
 
 def device_bytes(field: FieldWeights, basis: ChebyshevBasis) -> int:
-    """Memory that such a batch may take, about."""
+    """Return the approximate memory of such a batch."""
     # error terms before and after a layer, and their product with slopes
     columns = 3 * ERROR_TERMS * cells_at_once(field, basis) * field.width
     return 8 * (_ARRAYS * _VALUES + columns) + (1 << 29)
@@ -85,10 +85,10 @@ class RayBounds:
     Attributes:
         lower, upper: [n, 3] float64 bounds of the colours.
         alpha: [n, samples] float32 upper bounds of the opacity of every sample over the box.
-        cells: Cells of the network that were bounded.
-        displacement: Half the way of a sample over a cell that the network's bounds bear, as far as these rays tell.
+        cells: Number of bounded cells of the network.
+        displacement: Half the motion of a sample over a cell of suitable width, learned from these rays.
         parts: [2, n, shifts, *parts, 3] float32 lower and upper bounds, rounded outward, by part of the box, if a
-            division was given; one row of ``shifts`` where none were.
+            division was given; one row of ``shifts`` if there are none.
     """
 
     lower: np.ndarray
@@ -100,7 +100,7 @@ class RayBounds:
 
 
 def typical_displacement(parts: Sequence[RayBounds]) -> float:
-    """Return the geometric mean of the displacements of ``parts``, whatever their order."""
+    """Return the geometric mean of the displacements of ``parts``, independent of their order."""
     return math.exp(sum(math.log(part.displacement) for part in parts) / len(parts))
 
 
@@ -117,7 +117,7 @@ class RayRequest:
     shifts: list[Shifts]
 
     def take(self, which: np.ndarray) -> RayRequest:
-        """Some of the rays."""
+        """Return the request for some of the rays."""
         most_alpha = None if self.most_alpha is None else self.most_alpha[which]
         aim = None if self.aim is None else (self.aim[0][which], self.aim[1][which])
         return replace(self, pixels=self.pixels[which], most_alpha=most_alpha, aim=aim)
@@ -127,7 +127,7 @@ class BoundedRays(ABC):
     """Bounds of a field's rays over boxes of poses.
 
     Attributes:
-        displacement: Half the way of a sample over a first cell, as learned from earlier rays.
+        displacement: Half the motion of a sample over a first cell, as learned from earlier rays.
         distances, lengths: [samples] distances, and lengths of bins around them.
     """
 
@@ -139,14 +139,14 @@ class BoundedRays(ABC):
     @property
     @abstractmethod
     def compiled(self) -> bool:
-        """Whether kernels for a processor bound rays, a few at a time."""
+        """Whether compiled kernels bound rays, a few at a time."""
 
     @abstractmethod
     def division(self, moves: np.ndarray, most_parts: int = ..., deeper: int | None = None) -> Division | None:
-        """The cells of a box, as wide as bounds of the field bear; None: the box is too wide.
+        """Return the cells of a box, as wide as is suitable for the field's bounds; None: the box is too wide.
 
         Args:
-            moves: [n, samples, d] by how much samples move along each parameter.
+            moves: [n, samples, d] motion of samples along each parameter.
             deeper: Halvings of the first cells; None: as usual.
         """
 
@@ -161,12 +161,12 @@ class BoundedRays(ABC):
         shifts: list[Shifts] | None = None,
         division: Division | None = None,
     ) -> RayBounds:
-        """Bounds of the colours of ``pixels`` [n, 2] over every pose of ``box``.
+        """Return bounds of the colours of ``pixels`` [n, 2] over every pose of ``box``.
 
         Args:
-            tolerance: What a sample's open opacity or colour may move a pixel by before its cells are halved.
+            tolerance: Change of a pixel by a sample's open opacity or colour above which its cells are halved.
             most_alpha: [n, samples] upper bounds of opacities over a larger box.
-            aim: [n, 3] lower and upper colours; bounds between them are good enough (before the shifts).
+            aim: [n, 3] lower and upper colours; bounds between them are tight enough (before the shifts).
             shifts: Intervals of hue and saturation that are added to all colours; bounds hold over all of them.
             division: The cells, in place of those that suit the rays; bounds are then kept by part.
         """
@@ -178,14 +178,14 @@ class BoundedRays(ABC):
 
 
 class RayField(BoundedRays):
-    """A scene's field along the rays of a sampling, and what bounds it.
+    """A scene's field along the rays of a sampling, and its bounds.
 
     Args:
-        sampling: Uniform, or hierarchical: bounded where the coarse pass puts samples (design.md, F16), or wherever
-            they may be (F10, F14).
-        compiled: Whether by kernels compiled for a processor; None: where ``device`` is one.
-        white: Which samples are white, the others black, in place of the field's colours; None: these. Of uniform
-            samples alone.
+        sampling: Uniform, or hierarchical: bounded where the coarse pass puts samples (docs/dev/design.md, F16), or
+            wherever they may be (F10, F14).
+        compiled: Whether compiled kernels are used; None: where ``device`` is a CPU.
+        white: The samples that are white, the others black, in place of the field's colours; None: the latter. For
+            uniform samples alone.
     """
 
     def __init__(
@@ -217,5 +217,5 @@ class RayField(BoundedRays):
 
     @property
     def compiled(self) -> bool:
-        """Whether kernels for a processor bound the field."""
+        """Whether compiled kernels bound the field."""
         return self.field.compiled

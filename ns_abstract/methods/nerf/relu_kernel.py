@@ -47,8 +47,8 @@ class ReluInput(NamedTuple):
     """B pieces before an activation; see `PreActivation`.
 
     Attributes:
-        poly: [B, m, n] coefficients; replaced where the sign is open, and where a piece fails. What is off keeps its
-            own: its size is 0.
+        poly: [B, m, n] coefficients; replaced for unstable neurons, and for failed pieces. Inactive neurons keep their
+            own: their size is 0.
         sums: [B, n] sums of absolute columns.
         box: [B, n]; replaced.
         failed, count: [B].
@@ -65,10 +65,11 @@ class ReluOutput(NamedTuple):
     """B pieces behind an activation; see `PostActivation`.
 
     Attributes:
-        slope: [B, n] what columns are multiplied by.
+        slope: [B, n] factor of the columns.
         size, spread: [B, n] sums of absolute coefficients and columns, and of columns alone.
         failed, count: [B].
-        piece, neuron, error: [B n] piece, neuron and size of the new error terms, piece by piece, as many as there are.
+        piece, neuron, error: [B n] piece, neuron and size of the new error terms, piece by piece; only the first are
+            used.
     """
 
     slope: np.ndarray
@@ -82,7 +83,7 @@ class ReluOutput(NamedTuple):
 
 
 def grid_of(basis: ChebyshevBasis) -> FitGrid:
-    """The grid of a ``basis`` of one variable, whose ``grid`` is even."""
+    """Return the grid of a ``basis`` of one variable, whose ``grid`` is even."""
     points = basis.grid // 2 + 1
     values, fit = basis.evaluation[:points], basis.fit[:, :points]
     parts = values[:, 0::2], values[:, 1::2], fit[0::2], fit[1::2]
@@ -107,13 +108,13 @@ def _multiply(matrix, order, lanes, out):
 
 @njit(cache=True, error_model="numpy")
 def _degrees(grid):
-    """Room for coefficients of even and odd degrees, [., LANES]."""
+    """Return memory for coefficients of even and odd degrees, [., LANES]."""
     return np.empty((grid.fit_even.shape[0], LANES)), np.empty((grid.fit_odd.shape[0], LANES))
 
 
 @njit(cache=True, error_model="numpy")
 def _both(even, odd):
-    """Sums and differences of one line of rows."""
+    """Return sums and differences of one line of rows."""
     a0, a1, a2, a3, a4, a5 = even
     b0, b1, b2, b3, b4, b5 = odd
     sums = a0 + b0, a1 + b1, a2 + b2, a3 + b3, a4 + b4, a5 + b5
@@ -123,7 +124,7 @@ def _both(even, odd):
 
 @njit(cache=True, error_model="numpy")
 def _on_grid(even, odd, grid, values):
-    """``values`` [g, LANES] of polynomials with coefficients ``even`` and ``odd``."""
+    """Compute ``values`` [g, LANES] of polynomials with coefficients ``even`` and ``odd``."""
     factors, other = pointer(grid.even), pointer(grid.odd)
     terms, others, middle = grid.even.shape[1], grid.odd.shape[1], grid.points - 1
     elements, more, out, places = pointer(even), pointer(odd), pointer(values), pointer(grid.order)
@@ -145,7 +146,7 @@ def _on_grid(even, odd, grid, values):
 
 @njit(cache=True, error_model="numpy")
 def _gather(poly, which, neuron, even, odd):
-    """Coefficients of up to LANES neurons into ``even`` and ``odd``; lanes that are left are 0."""
+    """Copy coefficients of up to LANES neurons to ``even`` and ``odd``; spare lanes are 0."""
     (_, m, n), flat, places = poly.shape, poly.reshape(-1), np.empty(LANES, np.int64)
     for c in range(which.shape[0]):
         places[c] = which[c] * m * n + neuron[c]
@@ -159,7 +160,7 @@ def _gather(poly, which, neuron, even, odd):
 
 @njit(cache=True, error_model="numpy")
 def _absolute(even, odd, out):
-    """``out`` [LANES] sums of absolute coefficients."""
+    """Compute sums ``out`` [LANES] of absolute coefficients."""
     evens, odds, sums = pointer(even), pointer(odd), pointer(out)
     for c in range(0, LANES, LINE // out.itemsize):
         total = abs(load_line(evens, c))
@@ -172,9 +173,9 @@ def _absolute(even, odd, out):
 
 @njit(cache=True, error_model="numpy")
 def _certain(poly, rho, box, failed, slope, size, which, neuron):
-    """Decide the signs that the sums of coefficients decide; returns the number of the others (``which``, ``neuron``).
+    """Find the signs that the sums of coefficients decide; return the number of the others (``which``, ``neuron``).
 
-    See `_open` for the arguments; ``size`` is that of an active neuron where nothing is decided.
+    See `_open` for the arguments; ``size`` is that of an active neuron where the sign is open.
     """
     pieces, m, n = poly.shape
     spread = np.empty(n)
@@ -205,7 +206,7 @@ def _certain(poly, rho, box, failed, slope, size, which, neuron):
 
 @njit(cache=True, error_model="numpy")
 def _ranges(values, absolute, norming, low, high):
-    """``low`` and ``high`` [LANES] of polynomials from their values on the grid (design.md, F2)."""
+    """Compute ranges ``low`` and ``high`` [LANES] of polynomials from their values on the grid (design.md, F2)."""
     elements, sums, lows, highs = pointer(values), pointer(absolute), pointer(low), pointer(high)
     for c in range(0, LANES, LINE // values.itemsize):
         least = most = load_line(elements, c)
@@ -221,9 +222,9 @@ def _ranges(values, absolute, norming, low, high):
 
 @njit(cache=True, error_model="numpy")
 def _decide(poly, rho, box, grid, slope, size, which, neuron, found, low, high):
-    """As `_certain`, by the polynomials' ranges, which are kept in ``low`` and ``high`` [.] where they decide nothing.
+    """Do `_certain` by the polynomials' ranges, which are stored in ``low`` and ``high`` [.] where the sign stays open.
 
-    What is not a number stays open, and fails in `relu`.
+    NaN stays open, and fails in `relu`.
     """
     even, odd = _degrees(grid)
     values = np.empty((2 * grid.points - 1, LANES))
@@ -251,7 +252,7 @@ def _decide(poly, rho, box, grid, slope, size, which, neuron, found, low, high):
 
 @njit(cache=True, error_model="numpy")
 def _series(values, grid, sum_even, sum_odd, even, odd):
-    """Coefficients ``even`` and ``odd`` of the fit to the positive parts of ``values`` [g, LANES]."""
+    """Compute coefficients ``even`` and ``odd`` of the fit to the positive parts of ``values`` [g, LANES]."""
     elements, evens, odds, last = pointer(values), pointer(sum_even), pointer(sum_odd), values.shape[0] - 1
     middle = grid.points - 1
     for c in range(0, LANES, LINE // values.itemsize):
@@ -269,7 +270,7 @@ def _series(values, grid, sum_even, sum_odd, even, odd):
 
 @njit(cache=True, error_model="numpy")
 def _chords(even, odd, even_q, odd_q, chord, above, below):
-    """Distances [LANES] of ``p - q`` and ``q`` from their chords on the grid."""
+    """Compute distances [LANES] of ``p - q`` and ``q`` from their chords on the grid."""
     evens, odds, evens_q, odds_q = pointer(even), pointer(odd), pointer(even_q), pointer(odd_q)
     over, under = pointer(above), pointer(below)
     for c in range(0, LANES, LINE // even.itemsize):
@@ -287,7 +288,7 @@ def _chords(even, odd, even_q, odd_q, chord, above, below):
 
 @njit(cache=True, error_model="numpy")
 def _errors(values, fitted, above, below, least, most):
-    """Ends ``least`` and ``most`` [LANES] of ``max(0, p) - q`` from values of p and q on the grid (design.md, F5)."""
+    """Compute ends ``least``, ``most`` [LANES] of ``max(0, p) - q`` from p and q on the grid (design.md, F5)."""
     elements, fits, over, under = pointer(values), pointer(fitted), pointer(above), pointer(below)
     lows, highs = pointer(least), pointer(most)
     for c in range(0, LANES, LINE // values.itemsize):
@@ -308,7 +309,7 @@ def _errors(values, fitted, above, below, least, most):
 
 @njit(cache=True, error_model="numpy")
 def _open(poly, rho, box, failed, grid, slope, size, which, neuron, error):
-    """Slopes and sizes, and polynomials and boxes in place; returns the number of new error terms.
+    """Relax unstable neurons: slopes, sizes, polynomials and boxes in place; return the number of new error terms.
 
     See `relu`; ``rho``: [B, n] sums of absolute columns, ``which``, ``neuron`` and ``error``: new error terms.
     """
@@ -365,9 +366,9 @@ def _open(poly, rho, box, failed, grid, slope, size, which, neuron, error):
 
 @njit(cache=True, error_model="numpy")
 def relu(z, grid, limit, out):
-    """max(0, z) in place (design.md, F5); returns the number of new error terms.
+    """Compute max(0, z) in place (design.md, F5); return the number of new error terms.
 
-    ``limit``: error terms of a piece beyond which it fails. ``out``: `ReluOutput`, filled.
+    ``limit``: largest number of error terms of a piece, beyond which it fails. ``out``: `ReluOutput`, filled.
     """
     # arrays of a record are counted each time they are taken out of it
     poly, sums, box, old_failed, old_count = z

@@ -50,19 +50,19 @@ class Sampling:
 
     @property
     def bins(self) -> tuple[np.ndarray, np.ndarray]:
-        """[samples] distances of the bins' middles, and their lengths."""
+        """Return [samples] distances of the bins' middles, and their lengths."""
         edges = self.edges
         return 0.5 * (edges[1:] + edges[:-1]), edges[1:] - edges[:-1]
 
     @property
     def edges(self) -> np.ndarray:
-        """[samples + 1] float64 distances of the bins' ends (``UniformSampler`` outside training)."""
+        """Return [samples + 1] float64 distances of the bins' ends (``UniformSampler`` outside training)."""
         bins = np.linspace(0.0, 1.0, self.samples + 1)
         return bins * self.far + (1.0 - bins) * self.near
 
 
 def camera_rays(camera: PinholeCamera, pixels: np.ndarray) -> np.ndarray:
-    """[n, 3] float64 ray directions in camera axes, not normalised, of ``pixels`` [n, 2] (row, column)."""
+    """Return [n, 3] float64 ray directions in camera axes, not normalised, of ``pixels`` [n, 2] (row, column)."""
     rows, columns = np.asarray(pixels).T
     x = (columns + 0.5 - camera.cx) / camera.fx
     y = -(rows + 0.5 - camera.cy) / camera.fy
@@ -70,7 +70,7 @@ def camera_rays(camera: PinholeCamera, pixels: np.ndarray) -> np.ndarray:
 
 
 class RayRenderer(ABC):
-    """Renders pictures of a field ray by ray; ``rays`` and ``points`` are those of one kind of field."""
+    """Renders pictures of a field ray by ray; subclasses provide ``rays`` and ``points``."""
 
     dtype: torch.dtype = torch.float64
     device: torch.device = torch.device("cpu")
@@ -78,24 +78,24 @@ class RayRenderer(ABC):
     @property
     @abstractmethod
     def points(self) -> int:
-        """Points that are evaluated for a ray."""
+        """Number of evaluated points of a ray."""
 
     @abstractmethod
     def rays(self, pose: Tensor, directions: Tensor, shift: Shift | None = None) -> Tensor:
-        """Colours [n, 3] in [0, 1] along camera-axes ``directions`` [n, 3] from ``pose`` [3, 4]; differentiable.
+        """Return colours [n, 3] in [0, 1] along camera-axes ``directions`` [n, 3] from ``pose`` [3, 4]; differentiable.
 
         ``shift``: hue and saturation added to every point's colour (`hsv.shifted`).
         """
 
     def _directions(self, camera: PinholeCamera, pixels: np.ndarray) -> tuple[Tensor, ...]:
-        """Directions of ``pixels`` [n, 2], as many at a time as memory bears."""
+        """Return directions of ``pixels`` [n, 2] in batches that fit into memory."""
         directions = torch.from_numpy(camera_rays(camera, pixels)).to(self.device, self.dtype)
         return directions.split(max(1, _CHUNK // self.points))
 
     def pixels(
         self, camera: PinholeCamera, pose: np.ndarray, pixels: np.ndarray, shift: Shift | None = None
     ) -> np.ndarray:
-        """Colours [n, 3] float64 of ``pixels`` [n, 2] (row, column) from camera-to-world ``pose`` [3, 4]."""
+        """Return colours [n, 3] float64 of ``pixels`` [n, 2] (row, column) from camera-to-world ``pose`` [3, 4]."""
         matrix = torch.tensor(np.asarray(pose)).to(self.device, self.dtype)
         with torch.inference_mode():
             parts = []
@@ -105,13 +105,13 @@ class RayRenderer(ABC):
         return torch.cat(parts).double().cpu().numpy()
 
     def image(self, camera: PinholeCamera, pose: np.ndarray, shift: Shift | None = None) -> np.ndarray:
-        """The image [H, W, 3] float64."""
+        """Return the image [H, W, 3] float64."""
         return self.pixels(camera, pose, _every_pixel(camera), shift).reshape(camera.height, camera.width, 3)
 
     def picture(self, camera: PinholeCamera, pose: Tensor, shift: Shift | None = None) -> Tensor:
-        """The image [H, W, 3] from camera-to-world ``pose`` [3, 4]; differentiable.
+        """Return the image [H, W, 3] from camera-to-world ``pose`` [3, 4]; differentiable.
 
-        Rays are worked on once more where slopes are asked for, so that memory stays small.
+        Gradients render the rays once more, so that memory stays small.
         """
 
         def part(pose: Tensor, directions: Tensor) -> Tensor:
@@ -124,7 +124,7 @@ class RayRenderer(ABC):
 
 
 def _every_pixel(camera: PinholeCamera) -> np.ndarray:
-    """[H W, 2] rows and columns."""
+    """Return [H W, 2] rows and columns of all pixels."""
     return np.indices((camera.height, camera.width)).reshape(2, -1).T
 
 
@@ -132,7 +132,7 @@ class NerfRenderer(RayRenderer):
     """Renders rays of a scene.
 
     Args:
-        white: Which uniform samples are white, the others black, in place of the field's colours; None: these.
+        white: The uniform samples that are white, the others black, in place of the field's colours; None: the latter.
     """
 
     def __init__(
@@ -180,7 +180,7 @@ class NerfRenderer(RayRenderer):
 
     @property
     def points(self) -> int:
-        """Points that are evaluated for a ray."""
+        """Number of evaluated points of a ray."""
         s = self.sampling
         return s.samples + (s.importance if s.kind == "hierarchical" else 0)
 
@@ -197,9 +197,9 @@ class NerfRenderer(RayRenderer):
         return distances[:, 1:] - distances[:, :-1]
 
     def _densities(self, field: Field, origin: Tensor, world: Tensor, bins: Tensor) -> tuple[Tensor, Tensor, Any]:
-        """Densities [n, k] in the middles of the bins [n, k + 1], and base outputs [..., width] where it is evaluated.
+        """Return densities [n, k] in the middles of the bins [n, k + 1], and base outputs of the evaluated points.
 
-        The last value selects these points of [n, k]: where nothing is declared empty, all of them.
+        The last result selects these points of [n, k]: all of them where nothing is declared empty.
         """
         points = origin + world[:, None] * self._middles(bins)[..., None]
         if self.occupancy is None:
@@ -209,7 +209,7 @@ class NerfRenderer(RayRenderer):
         return _filled(density, inside), base, inside
 
     def _refined(self, bins: Tensor, weights: Tensor) -> Tensor:
-        """``PDFSampler.generate_ray_samples`` outside training: the union of old and new edges, sorted."""
+        """Return ``PDFSampler.generate_ray_samples`` outside training: the union of old and new edges, sorted."""
         weights = weights + HISTOGRAM_PADDING
         total = weights.sum(dim=-1, keepdim=True)
         padding = torch.relu(_SUM_EPS - total)
@@ -229,14 +229,14 @@ class NerfRenderer(RayRenderer):
 
 
 def _filled(values: Tensor, inside: Any) -> Tensor:
-    """``values`` [p, ...] in the places ``inside`` [n, k], zeros elsewhere; all of them where it selects all."""
+    """Return ``values`` [p, ...] at the places ``inside`` [n, k], zeros elsewhere; unchanged where it selects all."""
     if inside is ...:
         return values
     return values.new_zeros((*inside.shape, *values.shape[1:])).index_put(inside.nonzero(as_tuple=True), values)
 
 
 def interval_weights(density: Tensor, lengths: Tensor) -> Tensor:
-    """Weights [n, k] of densities [n, k] on bins of ``lengths`` [n, k] (``RaySamples.get_weights``)."""
+    """Return weights [n, k] of densities [n, k] on bins of ``lengths`` [n, k] (``RaySamples.get_weights``)."""
     depth = lengths * density
     before = torch.cat([torch.zeros_like(depth[:, :1]), torch.cumsum(depth[:, :-1], dim=1)], dim=1)
     return torch.nan_to_num((1.0 - torch.exp(-depth)) * torch.exp(-before))

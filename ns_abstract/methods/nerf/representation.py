@@ -1,4 +1,4 @@
-"""The representations of vanilla-NeRF and nerfacto runs; torch and the bounds are imported when one is opened."""
+"""The representations of vanilla-NeRF and nerfacto runs; torch and the bounds are imported when a run is opened."""
 
 from __future__ import annotations
 
@@ -41,7 +41,7 @@ def _nerfacto_method(
 def _of_runs(
     holds: Callable[[RunConfig], bool], load: Callable[[Any, Overrides], Any], method: Callable[..., Any]
 ) -> Representation:
-    """The representation of runs that ``holds`` tells from others."""
+    """Return the representation of the runs that ``holds`` recognises."""
     return Representation(lambda source: isinstance(source, RunConfig) and holds(source), load, method, rays=True)
 
 

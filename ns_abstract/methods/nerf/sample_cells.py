@@ -26,25 +26,28 @@ from ns_abstract.methods.nerf.ray_field import RAY_TUNING, RayBounds, RayField, 
 from ns_abstract.methods.nerf.samples import composite, field_hulls
 from ns_abstract.methods.nerf.white import WhiteSamples
 
-#: Samples of a ray that are bounded before the light that is left is looked at.
+#: Samples of a ray that are bounded between two updates of the transmittance.
 _BLOCK = 8
-#: A cell on which an opacity is open by this much everywhere was far too wide.
+#: Width of an opacity's bounds, by the network's error alone, from which on a whole cell counts as lost (too wide).
 _LOST = 0.5
-#: Shares of the first cells that were far too wide and factors by which later ones begin narrower: the first share that
-#: is exceeded counts. Work on wide cells is lost and there is more of it, as their error terms are more.
+#: Shares of first cells that were lost, and factors of the width of later first cells: the first share that is
+#: exceeded counts.
 _LOST_SHARES = ((0.25, 0.6), (0.04, 0.87))
-#: The share below which they begin wider, and the factor: this costs little, as the shares rise steeply with the width.
+#: Share of lost cells below which later first cells are wider, and the factor of their width.
 _FEW_LOST, _WIDER = 0.01, 1.08
-#: A sample is worth halving if it can take away this share of what a part has too much.
+#: A sample's cell is halved if this may remove at least this share of a part's excess width.
 _SHARE = 0.125
-#: Rounds of halving where the colours' bounds are too wide.
+#: Most rounds of halving where the colours' bounds are too wide.
 _ROUNDS = 32
-#: Bins are bounded with a tolerance so many times as large: their bounds are loose anyhow.
+#: Factor of the tolerance for bins, whose bounds are loose anyhow.
 _SWEPT = 8.0
 
 
 class SampleCellBounds:
-    """The bounds of one bundle of rays; see `BoundedRays.rays`."""
+    """Bounds a bundle of n rays by cells of every sample; see `BoundedRays.rays`.
+
+    Arrays by sample, ray and part of the box are [samples, n, parts].
+    """
 
     def __init__(
         self,
@@ -64,13 +67,13 @@ class SampleCellBounds:
         parts = math.prod(division.parts)
         self.alpha_low, self.alpha_high = np.zeros((samples, n, parts)), np.ones((samples, n, parts))
         self.color_low, self.color_high = np.zeros((samples, n, parts, 3)), np.ones((samples, n, parts, 3))
-        # what the network itself leaves open of opacities and colours, and the level of the cells that showed it
+        # widths of opacities (open) and colours (vague) by the network's error alone; level of the cells they are from
         self.open, self.vague = (np.ones((samples, n, parts), np.float32) for _ in range(2))
         self.level = np.full((samples, n, parts), -1, np.int8)
-        # light that reaches a sample, and what all samples so far let through
+        # upper bounds of the transmittance before each sample, and behind all samples so far
         self.before, self.light = np.ones((samples, n, parts), np.float32), np.ones((n, parts))
         self.cells, self.displacement = 0, displacement
-        # cells of samples that were the first, those of them that were too wide, and whether the box is not narrow
+        # first cells of samples, those of them that were lost, and whether some sample has several first cells
         self.tried, self.lost, self.wide = 0, 0, False
         # the first level whose cells are narrow enough for the sample
         self.start = division.first(moves, displacement)
@@ -110,22 +113,22 @@ class SampleCellBounds:
         )  # fmt: skip
 
     def _poses(self, values: np.ndarray, end: Callable[..., np.ndarray]) -> np.ndarray:
-        """[n, shifts, *parts, 3] of [n, shifts, parts, 3]: by part of the poses alone."""
+        """Reshape bounds ``values`` [n, shifts, parts, 3] to [n, shifts, *parts, 3]; ``end`` unites parts of bins."""
         apart = values.reshape(*values.shape[:2], *self.division.parts, 3)
         return end(apart, axis=-2) if self.owner.swept else apart
 
     @property
     def _dark(self) -> float:
-        """Light that does not matter any more."""
+        """Transmittance up to which further samples are not bounded."""
         return 0.1 * self.tolerance
 
     @property
     def _negligible(self) -> float:
-        """Light from a sample, at most, whose colour does not matter."""
+        """Weight of a sample up to which its colour is not bounded."""
         return (0.1 if self.owner.swept else 0.5) * self.tolerance
 
     def _level(self, level: int) -> tuple[Tensor, Tensor, np.ndarray]:
-        """Monomials at the nodes of every cell [cells, nodes, M], Bernstein matrix [parts, b, m], members."""
+        """Monomials at every cell's nodes [cells, nodes, M], Bernstein matrix [parts, b, m], `Division.members`."""
         if level not in self._levels:
             low, high = self.division.boxes(level)
             nodes = 0.5 * (low + high)[:, None] + 0.5 * (high - low)[:, None] * self.basis.nodes
@@ -138,11 +141,11 @@ class SampleCellBounds:
         return self._levels[level]
 
     def _rows(self, level: int, items: RayCells) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Where the parts [k, parts of a cell] of ``items`` stand in the arrays by sample, ray and part."""
+        """Index, for arrays by sample, ray and part, of the parts [k, parts of a cell] of the cells ``items``."""
         return items.sample[:, None], items.ray[:, None], self._level(level)[2][items.cell]
 
     def _bound_block(self, block: np.ndarray) -> None:
-        """Bound the samples ``block`` of all rays."""
+        """Bound the samples numbered ``block`` of all rays, halving cells whose weights are too wide."""
         waiting: dict[int, list[RayCells]] = {}
         for level in range(self.division.levels + 1):
             ray, place = np.nonzero((self.start[:, block] == level) & ~self.quiet[:, block])
@@ -176,7 +179,7 @@ class SampleCellBounds:
             waiting.setdefault(below, []).append(finer)
 
     def _learn(self) -> None:
-        """Cells should have started narrower if many of them were too wide, wider if few were."""
+        """Update the width of later rays' first cells: narrower if many cells were lost, wider if few were."""
         if self.tried < 32:
             return
         for share, narrower in _LOST_SHARES:
@@ -188,7 +191,7 @@ class SampleCellBounds:
             self.displacement *= _WIDER
 
     def _improve(self) -> None:
-        """Halve cells that leave colours open beyond the aim, round after round, on the parts where they do."""
+        """Halve, in rounds, the cells of samples that widen the colours most, on parts whose bounds miss the aim."""
         rays = np.arange(self.light.shape[0])
         below = np.array([*self.division.below, -1])
         for _ in range(_ROUNDS):
@@ -222,7 +225,10 @@ class SampleCellBounds:
         return np.argsort(members, axis=None) // members.shape[1]
 
     def _impact(self, rays: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Bounds [r, parts, 3] of ``rays``, and [samples, r, parts] what each sample leaves open of them (about)."""
+        """Lower and upper bounds [r, parts, 3] of ``rays``, and about how much each sample widens them.
+
+        The latter is [samples, r, parts]: the widening by the network's error alone, which halving removes.
+        """
         alpha_low, alpha_high = self._anywhere(self.alpha_low[:, rays], np.minimum), self.alpha_high[:, rays]
         top = self._anywhere(alpha_high, np.maximum)
         light = np.ones_like(alpha_low)
@@ -239,7 +245,10 @@ class SampleCellBounds:
         return low - rest, high + rest, light * (self.open[:, rays] * span + alpha_high * self.vague[:, rays])
 
     def _anywhere(self, values: np.ndarray, end: np.ufunc, axis: int = -1) -> np.ndarray:
-        """Where samples lie anywhere in their bins: the ``end`` of ``values`` by parts over the parts of the bin."""
+        """``values`` by part, or for bins their ``end`` (minimum, maximum) over all parts of the same bin.
+
+        With hierarchical sampling the last axis of parts is the place in the bin, where a sample may be anywhere.
+        """
         if not self.owner.swept:
             return values
         inner = self.division.parts[-1]
@@ -248,9 +257,9 @@ class SampleCellBounds:
         return np.repeat(end.reduce(values.reshape(shape), axis=axis + 1), inner, axis=axis)
 
     def _mixtures(self, rays: np.ndarray | slice, apart: bool) -> tuple[np.ndarray, np.ndarray, np.ndarray | float]:
-        """Bounds of the colours that samples or bins contribute, and what must be added to the result's (F10).
+        """Bounds of the colours of samples or bins, and a radius that the composited bounds must be widened by (F10).
 
-        ``apart``: what is negligible in a bin is added instead of mixed in.
+        ``apart``: parts of a bin of negligible weight widen the result instead of the bin's colour.
         """
         low, high = self.color_low[:, rays], self.color_high[:, rays]
         if not self.owner.swept:
@@ -265,13 +274,13 @@ class SampleCellBounds:
         return np.where(alone, 0.0, low), np.where(alone, 1.0, high), (rest * KEPT_LIGHT_UP)[..., None]
 
     def _background(self, count: int) -> np.ndarray:
-        """[count, parts, 3] the colour behind the last sample."""
+        """Background colour, repeated to [count, parts, 3]."""
         return np.tile(np.array(self.owner.sampling.background, np.float64), (count, self.light.shape[1], 1))
 
     def _bound_batch(self, level: int, items: RayCells, coarse: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Bound some cells of one level.
+        """Bound the cells ``items`` of one level; return three masks [k] of them.
 
-        Returns [k] which leave more light open than ``coarse``, which leave all of it, and which needed the network.
+        They are: a weight is wider than ``coarse``; the cell is lost (`_LOST`); the network was evaluated.
         """
         check_cancelled()
         halve, lost, tried = (np.zeros(len(items), bool) for _ in range(3))
@@ -288,7 +297,10 @@ class SampleCellBounds:
     def _occupied(
         self, level: int, items: RayCells, lines: np.ndarray, radius: np.ndarray
     ) -> tuple[np.ndarray, np.ndarray]:
-        """Which items may see occupied voxels, and [k] whether an item surely does; the others are made empty (F11)."""
+        """Indices of ``items`` that may meet occupied voxels, and [k] whether all of an item lies in such (F11).
+
+        The other items' opacities are set to 0. ``lines``, ``radius``: see `RayBundle.points`.
+        """
         everything = np.arange(len(items))
         if self.owner.occupancy is None:
             return everything, np.ones(len(items), bool)
@@ -306,7 +318,7 @@ class SampleCellBounds:
     def _bound_field(
         self, level: int, items: RayCells, lines: np.ndarray, radius: np.ndarray, sure: np.ndarray, coarse: float
     ) -> tuple[np.ndarray, np.ndarray]:
-        """`_bound_batch` by the network; where it is not ``sure`` [k], density may also be 0."""
+        """First two masks of `_bound_batch`, from the network; where not ``sure`` [k], density may also be 0."""
         device, field = self.owner.device, self.field
         monomials, bernstein, _ = self._level(level)
         self.cells += len(items)
@@ -328,7 +340,7 @@ class SampleCellBounds:
         alpha_low, alpha_high = opacity(low[..., 0], length, up=False), opacity(high[..., 0], length, up=True)
         bad = density.failed[:, None]
         alpha_low, alpha_high = torch.where(bad, 0.0, alpha_low), torch.where(bad, 1.0, alpha_high)
-        # what the network's own error leaves open, apart from the cell's width
+        # width by the network's error alone, without the colours' change over the cell
         middle = 0.5 * (low[..., 0] + high[..., 0])
         open_ = opacity(middle + error[:, :1], length, up=True) - opacity(middle - error[:, :1], length, up=False)
         open_ = torch.where(bad, 1.0, open_).cpu().numpy()
@@ -344,7 +356,7 @@ class SampleCellBounds:
         halved = (open_ * light).max(axis=1) > coarse
         halve[differing], lost[differing] = halved, halved & (open_.min(axis=1) > _LOST)
         shines = (high_a * light).max(axis=1) > self._negligible
-        # what is halved gets its colours from the halves, if there are any
+        # cells that will be halved get their colours from the halves
         final = ~halved | (self.division.below[level] < 0)
         coloured = np.flatnonzero(shines & final & ~density.failed.cpu().numpy())
         if coloured.size:
@@ -353,7 +365,7 @@ class SampleCellBounds:
         return halve, lost
 
     def _leave_alike(self, level: int, items: RayCells, density: PreActivation) -> np.ndarray:
-        """[k] whether next to nothing is seen of an item: that is all that is found out about it then."""
+        """[k] whether an item's opacity is negligible on the whole cell; if so, only its upper bound is stored."""
         length = torch.from_numpy(self.owner.lengths[items.sample]).to(density.poly.device)
         most = opacity(greatest(density)[:, 0], length, up=True)
         alike = ((most <= RAY_TUNING.alike * self.tolerance) & ~density.failed).cpu().numpy()
@@ -365,7 +377,10 @@ class SampleCellBounds:
         return alike
 
     def _color(self, level: int, items: RayCells, pieces: PostActivation, there: Tensor) -> None:
-        """Bound the colours of ``pieces``, those of ``items``; ``there``: monomials at their nodes."""
+        """Bound the colours of the cells ``items`` from their base outputs ``pieces``.
+
+        ``there`` [k, nodes, M] are the monomials at the cells' nodes.
+        """
         if self.owner.white is not None:
             self._whiten(self.owner.white, level, items)
             return
@@ -383,7 +398,7 @@ class SampleCellBounds:
         self.vague[where] = np.minimum(self.vague[where], slack[:, None])
 
     def _whiten(self, white: WhiteSamples, level: int, items: RayCells) -> None:
-        """Bound the colours of samples ``items`` that are white where they are chosen (Q3)."""
+        """Bound the colours of the cells ``items`` where selected samples are white and others black (Q3)."""
         distance = self.owner.distances[items.sample]
         lines, radius = self.bundle.points(items.ray, distance, 0.5 * self.owner.lengths[items.sample])
         low, high = self.division.boxes(level)
@@ -395,7 +410,7 @@ class SampleCellBounds:
 
     @staticmethod
     def _keep(lower: np.ndarray, upper: np.ndarray, rows: tuple, low: np.ndarray, high: np.ndarray) -> None:
-        """Intersect what is known with new bounds; what is not a number or crosses says nothing."""
+        """Intersect ``lower`` and ``upper`` at ``rows`` with new bounds, but for new ones that are NaN or reversed."""
         old_low, old_high = lower[rows], upper[rows]
         good = (low <= high) & np.isfinite(low) & np.isfinite(high)
         low = np.where(good, np.maximum(low, old_low), old_low)
@@ -405,14 +420,14 @@ class SampleCellBounds:
         upper[rows] = np.where(crossed, old_high, high)
 
     def _shifted(self, color: tuple[np.ndarray, np.ndarray], shift: Shifts) -> tuple[np.ndarray, np.ndarray]:
-        """Bounds of ``color`` (lower, upper) after ``shift``; [0, 1] where next to nothing is seen of it."""
+        """Bounds of ``color`` (lower, upper) after ``shift`` of hue and saturation; [0, 1] for negligible weights."""
         visible = self.before * self.alpha_high > RAY_TUNING.unseen
         low, high = np.zeros_like(color[0]), np.ones_like(color[1])
         low[visible], high[visible] = shifted_bounds(color[0][visible], color[1][visible], *shift)
         return low, high
 
     def _composite(self) -> tuple[np.ndarray, np.ndarray]:
-        """[n, parts, 3] bounds by part (design.md, F8)."""
+        """Lower and upper bounds [n, parts, 3] of the rays' colours by part, the best of all rules (design.md, F8)."""
         low, high = self._composited(False)
         if self.owner.swept:
             other_low, other_high = self._composited(True)
@@ -423,7 +438,7 @@ class SampleCellBounds:
         return low, high
 
     def _sampled(self, edges_low: np.ndarray, edges_high: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """[n, parts, 3] bounds by parts, from where the fine field is sampled (design.md, F14)."""
+        """Bounds [n, parts, 3] of the rays' colours by part, from bounds of the fine samples' edges (F14)."""
         owner, inner = self.owner, self.division.parts[-1]
         rows, samples, n = len(edges_low), self.alpha_low.shape[0], self.alpha_low.shape[1]
 
@@ -437,7 +452,7 @@ class SampleCellBounds:
             density_high = -np.log1p(-self.alpha_high) / owner.lengths[:, None, None] * (1.0 + DENSITY_ROUNDING)
         weight = self.before * self.alpha_high
         dim = weight <= self._negligible
-        # what is negligible takes the colour of what is not, at the price of its weight
+        # a part of negligible weight takes the others' colours; its weight widens the result
         price = along(np.where(dim, weight, 0.0)).reshape(rows, samples, inner).max(axis=2).sum(axis=1)
         colors = np.stack([
             along(np.where(dim[..., None], np.inf, self.color_low)),
@@ -459,7 +474,7 @@ class SampleCellBounds:
         return low, high
 
     def _composited(self, apart: bool) -> tuple[np.ndarray, np.ndarray]:
-        """[n, parts, 3] bounds by parts; ``apart``: see `_mixtures`."""
+        """Bounds [n, parts, 3] of the rays' colours by part, sample by sample (F8); ``apart``: see `_mixtures`."""
         low, high = self._background(len(self.light)), self._background(len(self.light))
         color_low, color_high, rest = self._mixtures(slice(None), apart)
         for k in range(self.alpha_low.shape[0] - 1, -1, -1):

@@ -1,7 +1,7 @@
-"""Bounds of hierarchically sampled rays that follow every sample along its path (design.md, F16).
+"""Bounds of hierarchically sampled rays from the path of every sample over a cell of poses (design.md, F16).
 
-On a cell of poses the coarse pass tells where each sample may be: on a line in the pose, but for a short rest. The fine
-field is bounded there and nowhere else, with the place in the rest as one more parameter of its polynomials.
+The coarse pass bounds each sample's distance by a linear function of the pose and a short radius. The fine field is
+bounded there and nowhere else; the place within the radius is one more parameter of its polynomials.
 """
 
 from __future__ import annotations
@@ -27,29 +27,29 @@ from ns_abstract.methods.nerf.render import Sampling
 from ns_abstract.methods.nerf.samples import composite, edge_bounds
 from ns_abstract.methods.nerf.zonotope import FieldBounds
 
-#: Parts of a cell, by axis and number of parameters: samples are told apart by them at no cost.
+#: Parts of a cell along each axis, by number of parameters, for which samples are bounded at little cost.
 _INNER = {1: 16, 2: 4}
 _INNER_MORE = 2
 
 
 @dataclass(frozen=True)
 class FollowTuning:
-    """Preferences of what follows samples. None of them decides whether a bound holds."""
+    """Preferences of bounds by sample paths. None of them decides whether a bound holds."""
 
-    #: Rays' cells that are worked on together, and samples of theirs between two looks at the light that is left.
+    #: Cells of rays that are bounded together, and samples between two updates of the transmittance.
     cells: int = 16
     block: int = 48
-    #: Light that does not matter any more, and light from a sample whose colour does not, as shares of the tolerance.
+    #: Transmittance below which samples, and weight below which colours are not bounded, as shares of the tolerance.
     dark: float = 2.0**-4
     negligible: float = 2.0**-9
-    #: Shares of first cells that were halved above and below which later ones begin narrower and wider, by these
-    #: factors; fewer cells tell nothing.
+    #: Shares of first cells that were halved above and below which later first cells become narrower and wider, by
+    #: these factors; and the least number of cells to decide that.
     many_lost: float = 0.5
     narrower: float = 0.6
     few_lost: float = 0.15
     wider: float = 1.25
     few: int = 8
-    #: What an open part of a cell may leave without an aim, in tolerances.
+    #: Width of a part's bounds, in tolerances, above which a cell is halved if there is no aim.
     enough: float = 2.0
 
 
@@ -61,8 +61,8 @@ class SampleLines:
     """Linear bounds of sample midpoints on cells: ``|m - (middle + slope p)| <= rest`` for p in [-1, 1]^d.
 
     Attributes:
-        middle, rest: [k, S].
-        slope: [k, S, d].
+        middle, rest: [k, S] distances at the cell's middle, and radii.
+        slope: [k, S, d] change of distance over half of each parameter's range.
     """
 
     middle: np.ndarray
@@ -71,9 +71,9 @@ class SampleLines:
 
     @staticmethod
     def around(low: np.ndarray, high: np.ndarray, counts: tuple[int, ...], straight: bool, far: float) -> SampleLines:
-        """Lines through the bounds [k, parts, S] of places on equal parts of cells, ``counts`` of them by axis.
+        """Lines that enclose the bounds ``low``, ``high`` [k, parts, S] of midpoints on equal parts of k cells.
 
-        ``straight``: without slopes. ``far``: the largest distance.
+        ``counts`` are the parts by axis. ``straight``: slopes are 0. ``far``: the largest distance, for rounding.
         """
         d = len(counts)
         places = np.array(list(np.ndindex(*counts)), np.float64).reshape(low.shape[1], d)
@@ -82,7 +82,7 @@ class SampleLines:
         if d and not straight:
             size = np.square(middles).sum(axis=0)
             slope = np.einsum("pj,kps->ksj", middles / np.maximum(size, NONZERO), 0.5 * (low + high))
-        # a part's places may be those of any of its poses
+        # within a part, a bound may belong to any pose
         room = (np.abs(slope) / np.array(counts)).sum(axis=2)
         along = np.einsum("pj,ksj->kps", middles, slope)
         least, most = (low - along).min(axis=1) - room, (high - along).max(axis=1) + room
@@ -91,10 +91,10 @@ class SampleLines:
 
 
 class SamplePaths:
-    """Bounds of a scene's rays by following their samples.
+    """Bounds of a scene's fields for sample paths, shared by all bundles of rays.
 
-    The ``coarse`` pass' field is by pose, the ``fine`` one by pose and one more parameter; the ``sampling`` is
-    hierarchical; ``occupancy`` tells where density is declared 0.
+    ``coarse`` bounds the coarse field over poses, ``fine`` the fine one over poses and the place within a path's
+    radius. ``sampling`` is hierarchical; ``batch`` is the number of samples that are bounded together.
     """
 
     def __init__(
@@ -104,22 +104,22 @@ class SamplePaths:
 
     @cached_property
     def degree(self) -> int:
-        """Of the Taylor models of poses: along a line in the pose a point has one more."""
+        """Degree of the Taylor models of poses; a point at a distance linear in the pose has one more."""
         return max(1, min(TAYLOR, self.fine.basis.degree - 1))
 
     @property
     def straight(self) -> bool:
-        """Whether the polynomials do not hold a sample that moves along a line."""
+        """Whether the fine field's degree is too low for distances with a slope, which are then 0."""
         return self.degree >= self.fine.basis.degree
 
     def edges(
         self, origin: np.ndarray, direction: np.ndarray, radii: tuple[np.ndarray, np.ndarray], counts: tuple[int, ...]
     ) -> tuple[np.ndarray, np.ndarray]:
-        """Bounds [k, parts, S + 1] of the fine samples' edges by parts of cells (design.md, F14).
+        """Lower and upper bounds [k, parts, S + 1] of the fine samples' edges, as distances, by part of k cells (F14).
 
         Args:
             origin, direction: [k, nodes, 3] of rays at the nodes of the coarse field's polynomials.
-            radii: [3] and [k, 3], what they are off by.
+            radii: [3] and [k, 3] error bounds of these.
             counts: Parts of every cell by axis.
         """
         field, parts, (distances, lengths) = self.coarse, math.prod(counts), self.sampling.bins
@@ -150,12 +150,15 @@ class SamplePaths:
 
     @staticmethod
     def base(field: FieldBounds, nodes: np.ndarray, radius: np.ndarray) -> tuple[PostActivation, PreActivation]:
-        """`FieldBounds.base` of points [k, nodes, 3]."""
+        """`FieldBounds.base` of points ``nodes`` [k, nodes, 3] with error bounds ``radius`` [k, 3]."""
         there, around = (torch.from_numpy(a).to(field.device) for a in (nodes, radius))
         return field.base(*field.encode(there, around, field.position))
 
     def look(self, field: FieldBounds, nodes: np.ndarray, radius: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """[k] whether some of the points may, and whether all must, lie where density is not declared 0 (F11)."""
+        """[k] whether points of a piece may, and whether all of them must, lie in occupied voxels (F11).
+
+        ``nodes`` [k, nodes, 3] are the points at the nodes of ``field``'s basis, ``radius`` [k, 3] their error bounds.
+        """
         if self.occupancy is None:
             return np.ones(len(nodes), bool), np.ones(len(nodes), bool)
         rows, rest = field.basis.interpolation
@@ -171,9 +174,9 @@ class _Level(NamedTuple):
 
     Attributes:
         boxes: [cells, d] lower and upper ends in [-1, 1].
-        members: [cells, kept parts of a cell] flat numbers of the parts that are kept.
-        counts: Parts by axis that a cell is bounded by.
-        part: [kept parts of a cell] the one of ``counts`` that each lies in.
+        members: [cells, stored parts of a cell] flat numbers of the parts whose bounds are stored.
+        counts: Computed parts of a cell by axis, for which bounds are computed.
+        part: [stored parts of a cell] the computed part that holds each stored one.
     """
 
     boxes: tuple[np.ndarray, np.ndarray]
@@ -183,7 +186,7 @@ class _Level(NamedTuple):
 
     @staticmethod
     def of(division: Division, level: int) -> _Level:
-        """See `_Level`."""
+        """The cells of ``level`` of a ``division``."""
         inner, most = division.inner(level), _INNER.get(division.dimensions, _INNER_MORE)
         counts = tuple(max(k for k in range(1, most + 1) if n % k == 0) for n in inner)
         part = np.arange(math.prod(counts)).reshape(counts)
@@ -193,13 +196,14 @@ class _Level(NamedTuple):
 
 
 class BundleBounds:
-    """The bounds of one bundle of rays, cell after cell, halved where they are too wide.
+    """Bounds of one bundle of n rays, cell after cell; cells whose colours are too wide are halved.
 
     Args:
         bundle: The rays over a box of poses; not swept.
-        division: Cells of the box, and the parts that are kept.
+        division: Cells of the box, and the parts whose bounds are stored.
         start: [n] the level of each ray's first cells.
-        aim: [n, 3] lower and upper colours; bounds between them are good enough (before the shifts).
+        tolerance: Width of colours that is aimed at.
+        aim: [n, 3] lower and upper colours; bounds between them are not refined (before the shifts).
         shifts: Intervals of hue and saturation that are added to all colours.
     """
 
@@ -218,7 +222,7 @@ class BundleBounds:
         self._levels: dict[int, _Level] = {}
 
     def run(self) -> None:
-        """Bound all rays."""
+        """Fill in `lower` and `upper` of all rays, level by level."""
         waiting = {int(k): [self._first(int(k))] for k in np.unique(self.start)}
         for level in range(self.division.levels + 1):
             if level not in waiting:
@@ -239,7 +243,7 @@ class BundleBounds:
         return RayCells(np.repeat(rays, cells), np.tile(np.arange(cells), rays.size))
 
     def samples(self, level: int, cells: RayCells) -> FollowedSamples:
-        """What the samples of cells of one level are."""
+        """Bounds of all samples of the given ``cells`` of one level."""
         owner, radii = self.owner, (self._radii[0], self._radii[1][cells.ray])
         counts = self._level(level).counts
         low, high = owner.edges(*self._at(owner.coarse, level, cells), radii, counts)
@@ -259,7 +263,7 @@ class BundleBounds:
         return monomials @ self.bundle.origin, monomials @ self.bundle.direction[cells.ray]
 
     def _bound(self, level: int, cells: RayCells) -> NDArray[np.bool_]:
-        """Bound cells of one level; [k] whether they are too wide."""
+        """Intersect bounds with those of ``cells`` of one level; return [k] whether their colours are too wide."""
         check_cancelled()
         self.cells += len(cells)
         samples, there = self.samples(level, cells), self._level(level)
@@ -283,7 +287,7 @@ class BundleBounds:
 
     @property
     def factor(self) -> float:
-        """How much wider first cells had better be: a cell that is halved costs three, two narrow ones two."""
+        """Factor of the width of later first cells: halving a cell costs three cells, two narrower ones cost two."""
         if self.tried < _TUNING.few:
             return 1.0
         share = self.lost / self.tried
@@ -291,10 +295,10 @@ class BundleBounds:
 
 
 class FollowedSamples:
-    """Bounds of the samples of several cells: densities and colours by part.
+    """Bounds of densities and colours of the S fine samples on k cells of rays, by part of the cells.
 
-    ``rays``: origins and directions [k, nodes, 3] at the fine field's nodes, off by ``radii``; ``low``, ``high`` [k,
-    parts, S + 1]: the samples' edges; ``counts``: parts by axis.
+    ``rays``: origins and directions [k, nodes, 3] at the fine field's nodes, with error bounds ``radii``; ``low``,
+    ``high`` [k, parts, S + 1] bound the samples' edges; ``counts``: parts by axis.
     """
 
     def __init__(
@@ -311,7 +315,7 @@ class FollowedSamples:
         self.density[1] = np.inf
         self.color = np.zeros((2, k, parts, samples, 3))
         self.color[1] = 1.0
-        # bounds of light that samples of which the colours do not count add
+        # total weight of the samples whose colours are left out
         self.price = np.zeros((k, parts))
         light = np.ones((k, parts))
         for start in range(0, samples, _TUNING.block):
@@ -324,7 +328,7 @@ class FollowedSamples:
             light *= np.exp(-(length * self.density[0][..., block]).sum(axis=-1)) * FOLLOWED_UP
 
     def _block(self, block: slice, bright: np.ndarray, light: np.ndarray) -> None:
-        """The samples ``block`` of the cells ``bright``, which ``light`` [k, parts] reaches at most."""
+        """Bound the samples ``block`` of the cells numbered ``bright``; ``light`` [k, parts]: transmittance before."""
         cell, sample = (a.ravel() for a in np.meshgrid(bright, np.arange(block.start, block.stop), indexing="ij"))
         batch = self.owner.batch
         for first in range(0, cell.size, batch):
@@ -332,7 +336,7 @@ class FollowedSamples:
             self._batch(cell[first : first + batch], sample[first : first + batch], light)
 
     def _batch(self, k: np.ndarray, i: np.ndarray, light: np.ndarray) -> None:
-        """Sample ``i`` of cell ``k``, [b] each."""
+        """Bound density and colour of the samples ``i`` [b] of the cells ``k`` [b]; ``light``: see `_block`."""
         owner, field, lines = self.owner, self.owner.fine, self.lines
         (origin, direction), d = self.rays, lines.slope.shape[2]
         there = (
@@ -382,7 +386,7 @@ class FollowedSamples:
         self.color[1][k, :, i] = np.where(good, high, self.color[1][k, :, i])
 
     def composite(self, shift: tuple[Range, Range] | None) -> tuple[np.ndarray, np.ndarray]:
-        """[k, parts, 3] bounds of what the rays show, after a ``shift`` of colours."""
+        """Lower and upper bounds [k, parts, 3] of the rays' colours, after a ``shift`` of all samples' colours."""
         color = self.color
         if shift is not None:
             color = color.copy()
@@ -398,6 +402,6 @@ class FollowedSamples:
         )  # fmt: skip
         slack = SAMPLE_ROUNDING * (2 * count + 5) + self.price.reshape(rows, 1) * FOLLOWED_UP
         low, high = np.clip(low - slack, 0.0, 1.0), np.clip(high + slack, 0.0, 1.0)
-        # what is not a number says nothing
+        # NaN becomes [0, 1]
         low, high = np.where(low <= high, low, 0.0), np.where(low <= high, high, 1.0)
         return low.reshape(k, parts, 3), high.reshape(k, parts, 3)

@@ -1,4 +1,4 @@
-"""Bounds of hierarchical sample positions, and of the colours of rays sampled there (design.md, F14)."""
+"""Bounds of the places of hierarchical samples, and of the colours of rays from samples there (design.md, F14)."""
 
 from __future__ import annotations
 
@@ -12,14 +12,14 @@ from ns_abstract.methods.nerf.render import HISTOGRAM_PADDING, Sampling
 
 
 def edge_bounds(alpha_low: np.ndarray, alpha_high: np.ndarray, sampling: Sampling) -> tuple[np.ndarray, np.ndarray]:
-    """Bounds [r, S + 1] of the sorted distances between which the fine field is sampled (design.md, F14).
+    """Lower and upper bounds [r, S + 1] of the sorted edges of the fine samples, as distances (design.md, F14).
 
-    ``alpha_low``, ``alpha_high`` [r, samples] are opacities of the coarse pass; S is ``samples + importance + 1``.
+    ``alpha_low``, ``alpha_high`` [r, samples] bound the coarse pass' opacities; S is ``samples + importance + 1``.
     """
     rows, bins = alpha_low.shape
     rounding = EDGE_ROUNDING * (bins + EDGE_BINS)
     one = np.ones((rows, 1))
-    # light that passes the bins before a knot, and those behind it, least and largest
+    # transmittance of the bins before a knot, and of those behind it: least and largest
     before, after = [], []
     for passed in (1.0 - alpha_high, 1.0 - alpha_low):
         before.append(np.cumprod(np.concatenate([one, passed], axis=1), axis=1))
@@ -48,13 +48,13 @@ def edge_bounds(alpha_low: np.ndarray, alpha_high: np.ndarray, sampling: Samplin
 
 @njit(cache=True, error_model="numpy")
 def field_hulls(edges_low, edges_high, start, step, densities, colors, density, color):
-    """Return bounds of the field at sample midpoints from its bounds on parts of the rays (design.md, F14).
+    """Write bounds of density and colour at the fine samples' midpoints from bounds on parts of the rays (F14).
 
     Args:
         edges_low, edges_high: [r, S + 1] of `edge_bounds`.
-        start, step: Where the first part begins, and the length of all.
+        start, step: Distance at which the first part begins, and length of every part.
         densities: [2, r, parts] least and largest, on equal parts of the rays.
-        colors: [2, r, parts, 3]; crossed where they do not count.
+        colors: [2, r, parts, 3] least and largest; infinity above -infinity for parts that are left out.
         density, color: [2, r, S], [2, r, S, 3]; overwritten.
     """
     parts = densities.shape[2]
@@ -77,10 +77,10 @@ def field_hulls(edges_low, edges_high, start, step, densities, colors, density, 
 
 @njit(cache=True, error_model="numpy")
 def composite(edges_low, edges_high, density, color, lower, upper):
-    """Return bounds of rays' colours from bounds of their sample positions and of the field there (design.md, F14).
+    """Composite rays from bounds of their samples' places, densities and colours; write bounds of the result (F14).
 
-    ``edges_low``, ``edges_high`` [r, S + 1]: of `edge_bounds`. ``density`` [2, r, S] and ``color`` [2, r, S, 3],
-    crossed where it does not count, are least and largest. ``lower``, ``upper`` [r, 3]: the background; overwritten.
+    ``edges_low``, ``edges_high`` [r, S + 1] are of `edge_bounds`, ``density`` [2, r, S] and ``color`` [2, r, S, 3]
+    (least above largest: left out) of `field_hulls`. ``lower``, ``upper`` [r, 3] hold the background first.
     """
     count = edges_low.shape[1] - 1
     ends = np.empty(2 * count + 2)
@@ -93,7 +93,7 @@ def composite(edges_low, edges_high, density, color, lower, upper):
             length = ends[k + 1] - ends[k]
             if length <= 0.0:
                 continue
-            # the intervals that may lie over this segment
+            # first and last sample whose interval may cover this segment
             while first > 0 and edges_high[r, first] > ends[k]:
                 first -= 1
             while last > 0 and edges_low[r, last] >= ends[k + 1]:

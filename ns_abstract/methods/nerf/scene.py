@@ -1,4 +1,4 @@
-"""A trained vanilla NeRF as plain arrays, independent of where it came from."""
+"""A trained vanilla NeRF as plain arrays: layers, encodings, sampling and background."""
 
 from __future__ import annotations
 
@@ -54,11 +54,11 @@ class Layer:
 
 
 class Waves(NamedTuple):
-    """The components of an encoded vector that have a nonzero weight.
+    """The components of an encoded vector that some weight uses.
 
     Attributes:
-        frequencies: [k] those of `Encoding.frequencies`.
-        columns: [6 k + 3] their places in the encoded vector, and those of the vector itself.
+        frequencies: [k] used frequencies of `Encoding.frequencies`.
+        columns: [6 k + 3] indices in the encoded vector of their sines and cosines, then of the input itself.
     """
 
     frequencies: NDArray[np.float64]
@@ -66,7 +66,7 @@ class Waves(NamedTuple):
 
 
 def _waves(encoding: Encoding, layers: Sequence[Layer]) -> Waves:
-    """What the ``layers``, whose first inputs are the encoded vector, look at."""
+    """`Waves` that have a nonzero weight in one of ``layers``, whose first inputs are the encoded vector."""
     looks = np.any([layer.weight[:, : encoding.size].any(axis=0) for layer in layers], axis=0)
     places = np.arange(encoding.size - 3).reshape(2, 3, encoding.count)
     used = looks[places].any(axis=(0, 1))
@@ -99,17 +99,17 @@ class FieldWeights:
 
     @cached_property
     def position_waves(self) -> Waves:
-        """Of the encoded position."""
+        """Components of the encoded position that the base uses."""
         return _waves(self.position, [layer for i, layer in enumerate(self.base) if i == 0 or layer.skip])
 
     @cached_property
     def direction_waves(self) -> Waves:
-        """Of the encoded direction."""
+        """Components of the encoded direction that the head uses."""
         return _waves(self.direction, self.head[:1])
 
     @property
     def plan(self) -> tuple[str, ...]:
-        """What is left out of the field, one sentence each."""
+        """Sentences that count the frequencies that bounds leave out because all their weights are 0."""
         pairs = (
             ("positions", self.position, self.position_waves),
             ("directions", self.direction, self.direction_waves),
@@ -137,12 +137,12 @@ class FieldWeights:
 
 @dataclass(frozen=True, kw_only=True)
 class FieldScene:
-    """What is told of any field.
+    """Name, source, units and assumptions of a NeRF of either kind.
 
     Attributes:
-        dataparser: Units of the training data against the normalised frame.
-        notes: What was assumed where the source says nothing, one sentence each.
-        assumptions: What was decided of the picture, and where each choice came from.
+        dataparser: Transform from the training data's frame to the normalised frame.
+        notes: Sentences on what was assumed because the source does not state it.
+        assumptions: Choices that the picture depends on, each with its origin.
     """
 
     dataparser: DataparserTransform = field(default_factory=DataparserTransform)

@@ -1,8 +1,8 @@
-"""Linear bounds of all rays of a frame over cells, from bounds by strip that are computed once (design.md, F12, F13).
+"""Linear bounds of all rays of a frame over cells, from cached bounds over strips of the set (design.md, F12, F13).
 
-The set of poses is cut into strips, ever narrower from level to level. Rays are bounded over whole strips, a group of
-neighbours at a time, and kept by part of the strip; a cell of a certificate takes what lies in it from there. What a
-strip holds depends on the strip and its group alone, whatever was asked before.
+The set of poses is cut into strips, narrower at every level. Rays are bounded over whole strips, in groups of
+neighbours, and bounds are cached by part of the strip; a cell takes those of the parts that it meets. The bounds of a
+strip depend on the strip and the group alone, not on earlier requests.
 """
 
 from __future__ import annotations
@@ -25,36 +25,35 @@ from ns_abstract.methods.nerf.planes import fit_planes
 from ns_abstract.methods.nerf.ray_bundle import RayBundle
 from ns_abstract.methods.nerf.ray_field import BoundedRays, RayBounds
 
-#: Rays that are bounded together by compiled kernels, and by torch alone, which wants many cells at a time.
+#: Rays of a group: for compiled kernels, and for torch, which needs many cells at a time.
 _GROUP, _GROUP_ON_DEVICE = 8, 64
-#: What an open sample may move a pixel by, by level.
+#: Colour tolerance of each level (`BoundedRays.rays`).
 TOLERANCES = (0.02, 0.005, 0.0012, 3e-4)
 #: Strips by axis from each level to the next: with one parameter, and with more.
 _FINER_LINE, _FINER = 4, 2
 #: Most parts of a strip: with one parameter, and with more.
 _PARTS_LINE, _PARTS = 512, 2048
-#: Halvings of a strip's first cells, with one parameter: planes are made of its parts, and of fine ones tighter.
+#: Halvings of a strip's first cells, with one parameter: planes through finer parts are tighter.
 _DEEPER_LINE = 4
 #: Most strips along an axis.
 _MOST = 1 << 20
-#: Parts of the range of hues or saturations, of the first level and from level to level.
+#: Parts of the range of hues or saturations at the first level, and factor from level to level.
 _SHIFT_PARTS, _SHIFT_FINER = 12, 2
-#: Part of the margin that the width of all pixels may cost; rays are refined down to the first where they cost more
-#: than the second.
+#: Shares of a property's margin: where pixels' widths cost more than the second, rays are refined down to the first.
 _AIM, _ENOUGH = 0.2, 0.4
-#: Bytes of bounds that are kept.
+#: Most bytes of bounds in the cache.
 _KEPT = 1 << 29
-#: Rays that are bounded to learn how long it takes and how wide cells may be.
+#: Rays and rounds of a trial that measures seconds and the width of first cells.
 _TRIED, _ROUNDS = 8, 3
 
-#: Bounds of one group: arguments of `BoundedRays.rays` behind the poses, by group, to what it found.
+#: Function from arguments of `BoundedRays.rays`, one tuple by group, to its results.
 BoundBatches = Callable[[Sequence[tuple]], list[RayBounds]]
 PixelWeightSource = Callable[[], "np.ndarray | None"]
 
 
 @dataclass(frozen=True)
 class _StripBounds:
-    """Bounds of one group of rays over a strip: [2, n, *parts, 3] by part, and [n, samples] opacities."""
+    """Bounds of n rays over a strip: colours [2, n, *parts, 3] by part, opacities' upper bounds [n, samples]."""
 
     parts: np.ndarray
     alpha: np.ndarray
@@ -70,7 +69,8 @@ class StripLayout:
 
     Attributes:
         counts: Strips of the first level along each parameter of the poses.
-        displacement: Where the bounds of every strip begin (`NerfBounds.displacement`).
+        division: Cells and stored parts of a strip.
+        displacement: `BoundedRays.displacement` with which the bounds of every strip begin.
     """
 
     counts: tuple[int, ...]
@@ -79,11 +79,12 @@ class StripLayout:
 
 
 class PoseStrips:
-    """Bounds of all rays of a frame over strips of its set (design.md, F13).
+    """Cache of bounds of all rays of a frame over strips of its set (design.md, F13).
 
     Args:
         pose_set: The frame's set; parameters that shift colours come last in its box.
         pixels: [t, 2] rows and columns of the rays.
+        run: Runs `BoundedRays.rays` for each tuple of arguments.
     """
 
     def __init__(self, bounds: BoundedRays, pose_set: PoseBox, pixels: np.ndarray, run: BoundBatches) -> None:
@@ -97,15 +98,13 @@ class PoseStrips:
         self._bytes = 0
         self._layout: StripLayout | None = None
         self._displacement = bounds.displacement
-        #: Strips of the first level, as far as the layout has got.
+        #: Number of strips of the first level; 1 until `layout` was called.
         self.count = 1
-        #: Seconds that a ray takes over a strip of the first level, once some have been tried.
+        #: Seconds that a ray takes over a strip of the first level; None until `layout` measured it.
         self.effort: float | None = None
 
-    # ---------------------------------------------------------------- layout
-
     def layout(self) -> StripLayout:
-        """Strips that the network's bounds bear, tried on a few rays in the middle of the set."""
+        """Strips narrow enough for the field's bounds, as a trial on a few rays in the middle of the set shows."""
         if self._layout is None:
             tried = self.pixels[np.unique(np.linspace(0, len(self.pixels) - 1, _TRIED).astype(int))]
             displacement = self._displacement
@@ -114,7 +113,7 @@ class PoseStrips:
                 self.count = math.prod(layout_found.counts)
                 strip = self._strip(layout_found.counts, tuple(n // 2 for n in layout_found.counts))
                 learned = displacement
-                # one ray first: where not even a few can be done, that tells how long they take
+                # one ray first, for a measurement even if there is no time for more
                 for rays in (tried[len(tried) // 2 :][:1], tried):
                     begin = time.perf_counter()
                     learned = self.run([self._call(strip, rays, layout_found, 0, None)])[0].displacement
@@ -154,7 +153,7 @@ class PoseStrips:
         return box
 
     def _ends(self, axis: int, count: int, first: int, past: int) -> np.ndarray:
-        """Ends of the strips from ``first`` to ``past`` (exclusive) of ``count`` along an axis of the poses."""
+        """Edges [past - first + 1] of the strips ``first`` to ``past`` (exclusive) of ``count`` along an axis."""
         low, high = self.poses.lower[axis], self.poses.upper[axis]
         ends = low + (high - low) * (np.arange(first, past + 1) / count)
         return np.where(np.arange(first, past + 1) == count, high, ends)
@@ -164,10 +163,8 @@ class PoseStrips:
         return tuple(n * finer**level for n in self.layout().counts)
 
     def _shift_ends(self, level: int) -> list[np.ndarray]:
-        """Edges of the parts of hue and saturation of a level; two where it is fixed."""
+        """Edges of a level's parts of the ranges of hue and saturation (`hsv.shift_ends`)."""
         return shift_ends(self.pose_set.box, self.pose_set.fixed, _SHIFT_PARTS * _SHIFT_FINER**level)
-
-    # ---------------------------------------------------------------- strips
 
     def _call(
         self, strip: ParameterBox, pixels: np.ndarray, layout: StripLayout, level: int, known: np.ndarray | None
@@ -176,7 +173,7 @@ class PoseStrips:
         return self.geometry, strip, pixels, TOLERANCES[level], known, None, shifts, layout.division
 
     def _ensure(self, level: int, place: tuple[int, ...], groups: Sequence[int]) -> list[_StripBounds]:
-        """Bounds of ``groups`` over a strip, those that are missing worked out."""
+        """Bounds of ``groups`` of rays over the strip ``place`` of a level; those not in the cache are computed."""
         computed: dict[int, _StripBounds] = {}
         missing = []
         for group in groups:
@@ -219,10 +216,8 @@ class PoseStrips:
             self._bytes -= self._known.popitem(last=False)[1].nbytes
         return strip_bounds
 
-    # ---------------------------------------------------------------- cells
-
     def levels(self, box: ParameterBox) -> int:
-        """Levels whose strips are not much narrower than the cell ``box``."""
+        """Number of levels of use for the cell ``box``: up to the first with strips under half of its width."""
         for level in range(1, len(TOLERANCES)):
             for axis, count in enumerate(self._counts(level)):
                 width = (self.poses.upper[axis] - self.poses.lower[axis]) / count
@@ -233,14 +228,14 @@ class PoseStrips:
     def cell_bounds(
         self, box: ParameterBox, weigh: PixelWeightSource | None, most_rays: int | None = None
     ) -> tuple[list[np.ndarray], np.ndarray, np.ndarray]:
-        """Linear bounds (A_lower, b_lower, A_upper, b_upper) [t, 3, d] and [t, 3], and lower and upper [t, 3].
+        """Linear bounds of t rays over a cell (A_lower, b_lower, A_upper, b_upper), and lower and upper bounds.
 
-        Of the first rays alone where not all are asked for: ``t`` is then ``most_rays``, or a few more.
+        Shapes are [t, 3, d] (A) and [t, 3]. The rays are all, or the first ones: ``most_rays``, or a few more.
 
         Args:
-            most_rays: How many rays are asked for; all if None.
-            weigh: Gives [t, 3] which part of the margin a unit of each pixel's width may cost, about; None there, or
-                in its place: nothing is worth refining.
+            most_rays: How many rays to bound; all if None.
+            weigh: Returns [t, 3] about which share of the margin a unit of each pixel's width costs. None, returned or
+                in its place: no ray is refined.
         """
         groups = [group for group in self.groups if most_rays is None or group.start < most_rays]
         linear, lower, upper = self._level_sets(box, 0, np.arange(len(groups)))
@@ -252,7 +247,7 @@ class PoseStrips:
                     break
             starts = [group.start for group in groups]
             cost = np.add.reduceat((weights[: len(lower)] * _widths(linear)).sum(axis=1), starts)
-            # what no level can make good is not begun
+            # no refinement if even the finest level would not suffice
             if not _ENOUGH < cost.sum() < TOLERANCES[level - 1] / TOLERANCES[levels - 1]:
                 break
             order = np.argsort(-cost, kind="stable")
@@ -267,7 +262,7 @@ class PoseStrips:
     def _level_sets(
         self, box: ParameterBox, level: int, groups: np.ndarray
     ) -> tuple[list[np.ndarray], np.ndarray, np.ndarray]:
-        """The same of the rays of some groups, from strips of one level."""
+        """`cell_bounds` of the rays of the ``groups``, from strips of one ``level``."""
         counts = self._counts(level)
         ranges = [self._overlapped(axis, count, box) for axis, count in enumerate(counts)]
         parts = self.layout().division.parts[: self.poses.dimensions]
@@ -299,7 +294,7 @@ class PoseStrips:
         return list(linear), values[0].min(axis=axes), values[1].max(axis=axes)
 
     def _overlapped(self, axis: int, count: int, box: ParameterBox) -> tuple[int, int]:
-        """First and past strip along an axis that the cell meets with more than an end."""
+        """First and past-the-last number of the strips along an axis that the cell overlaps by more than an end."""
         low, high = self.poses.lower[axis], self.poses.upper[axis]
         first = math.floor((box.lower[axis] - low) / (high - low) * count)
         past = math.ceil((box.upper[axis] - low) / (high - low) * count)
@@ -320,7 +315,10 @@ class PoseStrips:
 def _joined(
     kept: dict[tuple[int, ...], np.ndarray], ranges: list[tuple[int, int]], axis: int, place: tuple[int, ...]
 ) -> np.ndarray:
-    """The arrays of all places, side by side along the axes behind the first two."""
+    """Concatenate the arrays ``kept`` by place along their axes 2, 3, ..., for all places in ``ranges``.
+
+    ``axis`` and ``place`` are the state of the recursion: 0 and () at first.
+    """
     if axis == len(ranges):
         return kept[place]
     rows = [_joined(kept, ranges, axis + 1, (*place, k)) for k in range(*ranges[axis])]
@@ -328,5 +326,5 @@ def _joined(
 
 
 def _widths(linear: Sequence[np.ndarray]) -> np.ndarray:
-    """[t, 3] distances between the planes, on average over the cell."""
+    """[t, 3] mean distances over the cell between the planes b_lower, b_upper of `PoseStrips.cell_bounds`."""
     return linear[3].astype(np.float64) - linear[1]

@@ -1,4 +1,4 @@
-"""Which samples of a field are white where blending weights are asked for (docs/dev/design.md, Q3)."""
+"""Selection of samples that are drawn white to bound their blending weights (docs/dev/design.md, Q3)."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from ns_abstract.arithmetic.rounding import POINT_ROUNDING
 
 @dataclass(frozen=True)
 class WhiteSamples:
-    """Samples inside a box and nearer than a distance along the ray, channel by channel.
+    """Selection, channel by channel, of samples inside a box and nearer than a distance along the ray.
 
     Attributes:
         lower, upper: [3, 3] corners of each channel's box, infinite where there is none; reversed: a black channel.
@@ -25,18 +25,16 @@ class WhiteSamples:
     nearer: np.ndarray
 
     def at(self, points: Tensor, distances: Tensor) -> Tensor:
-        """[..., 3] colours of samples at ``points`` [..., 3] and ``distances`` [...] along their rays."""
+        """Colours [..., 3], 1 if selected and else 0, of samples at ``points`` [..., 3] and ``distances`` [...]."""
         low, high, nearer = (torch.from_numpy(v).to(points) for v in (self.lower, self.upper, self.nearer))
         there = points[..., None, :]
         inside = ((there >= low) & (there <= high)).all(dim=-1)
         return (inside & (distances[..., None] < nearer)).to(points.dtype)
 
     def between(self, low: np.ndarray, high: np.ndarray, distance: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """[k, 3] lower and upper bounds of the colours of samples that lie between ``low`` and ``high`` [k, 3].
+        """Lower and upper bounds [k, 3], each 0 or 1, of `at` for points between ``low`` and ``high`` [k, 3].
 
-        Args:
-            low, high: Bounds of the points; what is no number may be anywhere.
-            distance: [k] along the rays, up to the rounding of the renderer's.
+        A point with NaN bounds may lie anywhere. ``distance`` [k] is along the rays, up to the renderer's rounding.
         """
         low, high = low[:, None], high[:, None]
         surely = ((low >= self.lower) & (high <= self.upper)).all(axis=2)

@@ -55,7 +55,7 @@ def _pipeline(scene: NerfScene) -> dict[str, ArrayLike]:
 
 
 def field_states(names: Sequence[str]) -> dict[str, Any]:
-    """States of optimizers that have done nothing, of groups of parameters with these names."""
+    """Initial optimizer states of the parameter groups ``names``."""
     group = {"lr": 0.0005, "betas": (0.9, 0.999), "eps": 1e-8, "weight_decay": 0, "params": []}
     return {name: {"state": {}, "param_groups": [group]} for name in names}
 
@@ -121,7 +121,7 @@ def write_nerfacto_run(
 
 
 class _Shown:
-    """What a data set shows of a scene."""
+    """Background and units of a nerfacto, as `write_run` needs them for the data set's pictures."""
 
     def __init__(self, scene: NerfactoScene) -> None:
         behind = scene.field.background
@@ -130,7 +130,10 @@ class _Shown:
 
 
 def _grid(encoding: HashEncoding) -> dict[str, int]:
-    """The sizes of a grid, of which the greatest resolution is the least that gives its own."""
+    """Settings of a hash grid by Nerfstudio's names; max_res is the least that yields the grid's resolutions.
+
+    Raises ValueError: none does.
+    """
     from ns_abstract.methods.nerf.nerfacto_load import resolutions
 
     levels, rows, features = encoding.table.shape

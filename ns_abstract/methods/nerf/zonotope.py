@@ -49,25 +49,21 @@ _ELLIPSES = (1.05, 1.15, 1.3, 1.6, 2.0, 2.6, 3.5, 5.0, 8.0, 14.0, 30.0, 80.0, 30
 #: Last layers of the base whose columns are multiplied in float32, as those of the head: the later a radius begins, the
 #: less it grows.
 _NARROW_LAYERS = 4
-#: Most that an encoded vector's degree by variable may be: that of `ns_abstract.methods.nerf.ray_bundle.TAYLOR`, and
-#: one of
-#: a place that moves along the ray.
+#: Largest degree by variable of a vector to encode: `TAYLOR`, and one more if the distance moves with the pose.
 VECTOR_DEGREE = TAYLOR + 1
-#: Error terms of a piece beyond which it is given up.
+#: Most error terms of a piece; with more, it fails and its outputs have no bounds.
 ERROR_TERMS = 400
-
-
 #: Polynomials [B, m, k] and remainders [B, k] of an encoded vector.
 Encoded = tuple[Tensor, Tensor]
 
 
 def _rounding(inputs: int) -> float:
-    """Relative error of a layer of ``inputs``: of this module's sums, and of a concrete float64 evaluation."""
+    """Relative error of a layer with so many ``inputs``: of sums here and of a concrete float64 evaluation together."""
     return 2.0 * gamma(inputs + 4)
 
 
 def _before(pieces: PostActivation, kind: torch.dtype) -> PostActivation:
-    """``pieces`` for compiled layers, with columns of the type ``kind``."""
+    """``pieces`` as NumPy arrays for compiled layers, with columns of the type ``kind``."""
     return PostActivation(*(tensor.numpy() for tensor in pieces._replace(columns=pieces.columns.to(kind))))
 
 
@@ -75,9 +71,8 @@ def _before(pieces: PostActivation, kind: torch.dtype) -> PostActivation:
 class _FieldLayer:
     """A linear layer: transposed ``weight`` [in, out], its ``absolute`` value and ``bias`` [out], all float64.
 
-    The first ``seen`` inputs are an encoded vector's, those behind them neurons.
-    For compiled products: ``lines``, the weight with zeros behind its rows to whole pairs of lines, and ``narrow``, the
-    same in float32, which it is exactly, where columns are multiplied in that.
+    The first ``seen`` inputs are an encoded vector's, the others neurons. For compiled products, ``lines`` is the
+    weight with rows padded to whole pairs of cache lines; ``narrow`` is the same in float32 (exact), or None.
     """
 
     seen: int
@@ -89,17 +84,18 @@ class _FieldLayer:
 
 
 def _seeing(layer: Layer, encoding: Encoding, waves: Waves) -> Layer:
-    """``layer``, whose first inputs are the encoded vector, without those that nothing looks at."""
+    """``layer``, whose first inputs are the encoded vector, without the inputs that are not among ``waves``."""
     columns = np.concatenate([waves.columns, np.arange(encoding.size, layer.weight.shape[1])])
     return replace(layer, weight=np.ascontiguousarray(layer.weight[:, columns]))
 
 
 class FieldBounds:
-    """Bounds of one field.
+    """Propagates Chebyshev zonotopes through one field's networks.
 
     Args:
-        limit: Error terms by piece beyond which it is given up.
-        compiled: Whether by kernels compiled for a processor; None: where ``device`` is one.
+        basis: Chebyshev basis of the polynomials.
+        limit: Most error terms of a piece before it fails.
+        compiled: Whether compiled CPU kernels are used; None: if ``device`` is a CPU.
     """
 
     def __init__(
@@ -135,14 +131,13 @@ class FieldBounds:
         self._imaginary = (
             0.5 * (ellipses[:, None, None] ** degrees.T - ellipses[:, None, None] ** -degrees.T) * ELLIPSE_UP
         )
-        # [ellipses, d] the same of the highest power that an encoded vector has
+        # [ellipses, d] the same bound for the highest degree of a vector to encode
         self._steepest = self._imaginary.masked_fill(degrees.T > VECTOR_DEGREE, 0.0).amax(dim=2)
         self._decay = 4.0 * ellipses**-basis.degree / (ellipses - 1.0) * ELLIPSE_UP
-
         self._bernstein: dict[tuple[int, ...], Tensor] = {}
 
     def bernstein(self, parts: tuple[int, ...]) -> Tensor:
-        """`ChebyshevBasis.bernstein` of the basis, kept."""
+        """`ChebyshevBasis.bernstein` of the basis for ``parts`` by axis, cached."""
         if parts not in self._bernstein:
             self._bernstein[parts] = torch.from_numpy(self.basis.bernstein(parts)).to(self.device)
         return self._bernstein[parts]
@@ -158,18 +153,15 @@ class FieldBounds:
         lines = functional.pad(weight, (0, -weight.shape[1] % (LINE // 2))) if self.compiled else weight
         return _FieldLayer(seen_inputs, weight, weight.abs(), bias, lines, lines.float() if narrow else None)
 
-    # --- encodings -----------------------------------------------------------------------------
-
     def encode(self, nodes: Tensor, radius: Tensor, seen: Waves) -> tuple[Tensor, Tensor]:
         """Polynomials and remainders of an encoded vector (design.md, F3).
+
+        Returns [B, m, k] coefficients and [B, k] remainders of the k components ``seen``.
 
         Args:
             nodes: [B, nodes, 3] the vector's polynomial at the basis' nodes. Its degree by variable is at most
                 the basis' and `VECTOR_DEGREE`.
             radius: [B, 3] distance of the vector from the polynomial.
-
-        Returns:
-            [B, m, k] coefficients, [B, k] remainders, of the columns seen.
         """
         omega = 2.0 * np.pi * torch.from_numpy(seen.frequencies).to(self.device)
         angles = (nodes[..., None] * omega).flatten(-2)
@@ -181,7 +173,7 @@ class FieldBounds:
         lebesgue, largest = self.basis.lebesgue, nodes.abs().amax(dim=1)
         remainder = torch.zeros_like(radius)[..., None].expand(-1, -1, omega.numel())
         for j in range(self.basis.dimensions):
-            # the parts of x above the degree belong to the highest power that the basis has
+            # terms of x above the degree are bounded like the basis' highest degree
             tops = self._imaginary[:, j].max(dim=1).values
             phase = torch.einsum("em,bmi->bie", self._imaginary[:, j], x.abs()) + rest[..., None] * tops
             rounded = self.basis.interpolation_rounding * largest[..., None] * self._steepest[:, j]
@@ -196,10 +188,8 @@ class FieldBounds:
         plain = radius + rest + self.basis.interpolation_rounding * (1.0 + largest)
         return poly, (torch.cat([waves, waves, plain], dim=-1) + dropped) * FIELD_UP
 
-    # --- layers --------------------------------------------------------------------------------
-
     def _linear(self, pieces: PostActivation, layer: _FieldLayer, first: Encoded) -> PreActivation:
-        """A linear layer on ``pieces``, and on the encoded vector ``first`` if the layer sees it (F4)."""
+        """Propagate ``pieces`` through a linear layer; ``first``: encoded vector, used if it is an input (F4)."""
         if self.compiled:
             return self._linear_compiled(pieces, layer, first)
         seen_inputs, rounding = layer.seen, _rounding(layer.weight.shape[0])
@@ -220,7 +210,7 @@ class FieldBounds:
         return PreActivation(poly, columns, owner, spread, box * FIELD_UP, pieces.failed, pieces.count)
 
     def _weights(self, layer: _FieldLayer) -> LayerWeights:
-        """``layer`` for compiled products."""
+        """``layer`` as arrays for compiled products."""
         seen_inputs, narrow = layer.seen, layer.narrow is not None
         kind = layer.lines if layer.narrow is None else layer.narrow
         lines, absolute = layer.lines.numpy(), layer.absolute.numpy()
@@ -237,7 +227,7 @@ class FieldBounds:
         )
 
     def _linear_compiled(self, pieces: PostActivation, layer: _FieldLayer, first: Encoded) -> PreActivation:
-        """See `_linear`."""
+        """`_linear` by compiled kernels."""
         encoded, remainder = (a.contiguous() for a in first)
         (batch, m, _), n = pieces.poly.shape, layer.weight.shape[1]
         total = pieces.owner.shape[0] + pieces.new_owner.shape[0]
@@ -255,9 +245,9 @@ class FieldBounds:
     def _through(
         self, pieces: PostActivation, layers: StackedLayers, last: StackedLayers, first: Encoded, grid: FitGrid
     ) -> tuple[PostActivation, PreActivation]:
-        """``layers`` with their activations and the ``last`` one, compiled; see `_linear`.
+        """Propagate ``pieces`` through ``layers`` with ReLU and the ``last`` layer without, by compiled kernels.
 
-        The last one's columns are left out.
+        Returns zonotopes behind both; those behind ``last`` have no columns, only their sums. ``first``: see `_linear`.
         """
         encoded, remainder = (a.contiguous() for a in first)
         (batch, m, _), n = pieces.poly.shape, int(layers.shapes[-1, 2])
@@ -285,7 +275,7 @@ class FieldBounds:
         return out, PreActivation(poly, out.columns[:0, :0], out.owner[:0], sums, radius, out.failed, out.count)
 
     def _relu(self, z: PreActivation) -> PostActivation:
-        """max(0, z) (design.md, F5); ``z`` is used up."""
+        """Zonotopes behind a ReLU of the zonotopes ``z`` (design.md, F5)."""
         rho = z.spread * FIELD_UP
         poly, box = z.poly, z.box
         spread = poly[:, 1:].abs().sum(dim=1) * FIELD_UP
@@ -364,7 +354,7 @@ class FieldBounds:
         return q, error
 
     def _least(self, values: Tensor) -> Tensor:
-        """Least value at the corners of every interval (rectangle, ...) of the grid: [k, cells] of [k, g]."""
+        """[k, cells] least of ``values`` [k, g] at the corners of every interval (rectangle, ...) of the grid."""
         side, d = self.basis.grid + 1, self.basis.dimensions
         if d == 0:
             return values
@@ -373,12 +363,10 @@ class FieldBounds:
             grid = torch.minimum(grid.narrow(axis, 0, side - 1), grid.narrow(axis, 1, side - 1))
         return grid.flatten(1)
 
-    # --- networks ------------------------------------------------------------------------------
-
     def base(self, poly: Tensor, remainder: Tensor) -> tuple[PostActivation, PreActivation]:
-        """The base network on an encoded position (`encode`), and the density before its softplus, one output.
+        """Zonotopes of the base network's outputs from an encoded position (`encode`), and of the density's output.
 
-        The density's columns are left out.
+        The latter is before softplus, one output, and without columns.
         """
         first, pieces = (poly, remainder), self._nothing(poly)
         if self._grid is not None:
@@ -393,7 +381,7 @@ class FieldBounds:
 
     @cached_property
     def _base_stacks(self) -> list[tuple[StackedLayers, StackedLayers]]:
-        """Layers of the base, those together whose columns are of one type, and the one behind them, if any."""
+        """Base layers, stacked by type of columns, each stack with the layer behind it: density's, or none."""
         layers = [self._weights(layer) for layer in self._base]
         parts = [stacked(list(group)) for _, group in itertools.groupby(layers, key=lambda layer: layer.columns.dtype)]
         last = stacked([self._weights(self._density)])
@@ -401,11 +389,11 @@ class FieldBounds:
 
     @cached_property
     def _head_stacks(self) -> tuple[StackedLayers, StackedLayers]:
-        """Layers of the head, and the colour's."""
+        """Stacks of the head's layers, and of the colour layer alone."""
         return stacked([self._weights(layer) for layer in self._head]), stacked([self._weights(self._color)])
 
     def _nothing(self, poly: Tensor) -> PostActivation:
-        """As many pieces as ``poly`` [B, m, k] has, of no neuron."""
+        """`PostActivation` of B pieces without neurons, as many pieces as ``poly`` [B, m, k] has."""
         none = poly[:, 0, :0]
         index = torch.zeros(0, dtype=torch.int64, device=self.device)
         failed = torch.zeros(len(poly), dtype=torch.bool, device=self.device)
@@ -415,7 +403,7 @@ class FieldBounds:
         )  # fmt: skip
 
     def color(self, pieces: PostActivation, poly: Tensor, remainder: Tensor) -> PreActivation:
-        """The three colour channels before their sigmoid, from an encoded direction; its columns are left out."""
+        """Zonotopes, without columns, of RGB before the sigmoid, from base outputs and an encoded direction."""
         first = poly, remainder
         if self._grid is not None:
             return self._through(pieces, *self._head_stacks, first, self._grid)[1]

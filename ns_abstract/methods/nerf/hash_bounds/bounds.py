@@ -43,7 +43,7 @@ _SHARE, _SHARES = 4, 4
 
 @dataclass(frozen=True)
 class HashTuning:
-    """Steps of the search for pieces that are narrow enough. None of them decides whether a bound holds."""
+    """Preferences of the search for sub-boxes that are narrow enough; soundness does not depend on them."""
 
     #: Distance whose points tell how far a ray moves, normalised units, and half of what they move by on a first piece.
     distance: float = 1.0
@@ -86,13 +86,13 @@ class HashBounds(BoundedRays):
 
     @property
     def compiled(self) -> bool:
-        """Rays are bounded one after another by compiled kernels."""
+        """True: compiled kernels bound rays one after another."""
         return True
 
     def division(
         self, moves: np.ndarray, most_parts: int = _TUNING.most_first, deeper: int | None = None
     ) -> Division | None:
-        """The parts for which bounds over a box are kept; None: the box is too wide. ``moves`` [n, samples, d]."""
+        """Return the parts of a box whose bounds are stored; None: it is too wide. ``moves`` [n, samples, d]."""
         finer = _TUNING.finer if moves.shape[2] == 1 else 0
         return division_for(moves, self.displacement, most_parts, 0, finer)
 
@@ -123,7 +123,7 @@ class HashBounds(BoundedRays):
         return result
 
     def _first_cells(self, moves: np.ndarray, displacement: float) -> np.ndarray | None:
-        """[n, d] pieces by axis on which points move by at most ``displacement``; None where these are too many."""
+        """Return [n, d] sub-boxes by axis over which points move by at most ``displacement``; None: too many."""
         if not np.isfinite(moves).all():
             return None
         d = moves.shape[1]
@@ -154,7 +154,7 @@ class HashBounds(BoundedRays):
         self._rooms.append(room)
 
     def _learned(self, displacement: float, bounded: np.ndarray) -> float:
-        """Where later rays had better begin."""
+        """Return a better displacement of later rays' first sub-boxes."""
         if not self.dimensions:
             return displacement
         first, finite = bounded[:, 0].sum(), bounded[:, 2].sum()
@@ -173,7 +173,7 @@ def _density(encoding: HashEncoding, net: DenseNet, scale: float) -> DensityArra
 
 
 def field_arrays(field: NerfactoField) -> FieldArrays:
-    """The arrays of ``field`` for kernels."""
+    """Return the arrays of ``field`` for kernels."""
     last, piecewise = isinstance(field.background, str), field.spacing == "piecewise"
     place = spacing if piecewise else float
     return FieldArrays(
@@ -187,14 +187,14 @@ def field_arrays(field: NerfactoField) -> FieldArrays:
 
 
 def _rooms(net: NetWeights, symbols: int, layers: int = 0) -> tuple[LayerZonotope, ...]:
-    """Neurons of every layer, at least ``layers``; ``symbols`` rows before its first ReLU."""
+    """Return memory for the neurons of every layer, at least ``layers``; ``symbols`` rows before its first ReLU."""
     rows = symbols + int(net.sizes[1:-1].sum())
     rooms = tuple(zonotope(rows, int(n)) for n in net.sizes[1:])
     return rooms + (zonotope(1, 1),) * (layers - len(rooms))
 
 
 def piece_room(field: NerfactoField, arrays: FieldArrays, dimensions: int) -> PieceRoom:
-    """Scratch of one thread for sets of so many parameters."""
+    """Return scratch of one thread for sets of ``dimensions`` parameters."""
     n = form_width(dimensions)
     densities = (*arrays.proposals, arrays.density)
     features = [one.table.shape[0] * one.table.shape[2] for one in densities]
@@ -232,7 +232,7 @@ class NerfactoFrame(FieldFrame):
         super().__init__(pose_set, NerfactoRenderer(scene.field), bounds, _SHARE, at_once, workers)
 
     def _tried(self, calls: Sequence[Sequence[Any]]) -> list[RayBounds | None]:
-        """See `FieldFrame`; in threads."""
+        """See `FieldFrame`; runs in threads."""
 
         def bounded(call: Sequence[Any]) -> RayBounds | None:
             try:

@@ -1,4 +1,4 @@
-"""Colours of rays from light and colours of their samples: intervals and forms, intersected (design.md, F8, H7).
+"""Composites the colours of rays from transmittances and sample colours, as intervals and forms (design.md, F8, H7).
 
 ``light`` is a `Light`, ``count`` the number N of its intervals, ``line`` as in `forms`.
 """
@@ -16,10 +16,10 @@ from ns_abstract.methods.nerf.hsv import shift_box
 
 @njit(cache=True, error_model="numpy", **UNCOUNTED)
 def interval_colors(light, count, low, high, background, last, out):
-    """Bounds ``out`` [2, 3] of a ray's colour from those of its samples alone (design.md, F8).
+    """Write bounds ``out`` [2, 3] of a ray's colour from bounds of its samples alone (design.md, F8).
 
-    ``low`` and ``high`` [N, 3] bound the colours. With ``last``, the last sample's colour stands behind it, and the
-    ``background`` [3] is not looked at.
+    ``low`` and ``high`` [N, 3] bound the samples' colours. With ``last``, the last sample's colour is the background,
+    and ``background`` [3] is not used.
     """
     for c in range(3):
         out[0, c] = low[count - 1, c] if last else background[c]
@@ -39,7 +39,7 @@ def interval_colors(light, count, low, high, background, last, out):
 
 @njit(cache=True, error_model="numpy", **UNCOUNTED)
 def shifted_interval_colors(light, count, colors, shift, background, last, room, out):
-    """`interval_colors` [2, 3] where hue and saturation are added to all samples' colours (design.md, F9).
+    """Do `interval_colors` [2, 3] with hue and saturation added to all samples' colours (design.md, F9).
 
     ``colors`` [2, N, 3] are bounds of colours before the ``shift`` [2, 2], intervals of hue (turns) and saturation;
     ``room`` [2, N, 3] is scratch, ``out`` [2, 3] in [0, 1].
@@ -55,7 +55,7 @@ def shifted_interval_colors(light, count, colors, shift, background, last, room,
 
 @njit(cache=True, error_model="numpy", **UNCOUNTED)
 def weight_bounds(light, i, last):
-    """Bounds of the weight of sample i; ``last``: of what the picture takes of its colour, if it is the last one."""
+    """Return bounds of the weight of sample i; with ``last``, the last sample's weight includes the background's."""
     if last:
         return light.left[i, 0], light.left[i, 1]
     low = light.left[i, 0] * max(1.0 - exp_above(-light.least[i]), 0.0)
@@ -65,11 +65,11 @@ def weight_bounds(light, i, last):
 
 @njit(cache=True, error_model="numpy", **UNCOUNTED)
 def _products(light, count, i, whole, color, line):
-    """Products of deviations of the weight of sample i and of its colour: the centre's shift, its coefficient, rest.
+    """Return the product of the deviations of sample i's weight and colour: centre's shift, its coefficient, rest.
 
     Args:
         light, count: `Light` and N.
-        whole: Whether all light that reaches it is its weight.
+        whole: Whether all light that reaches the sample is its weight.
         color: [n + 4] the deviation of its colour: symbols and radius.
     """
     n = color.shape[0] - 4
@@ -96,7 +96,7 @@ def _products(light, count, i, whole, color, line):
 
 @njit(cache=True, error_model="numpy", **UNCOUNTED)
 def form_color(light, count, colors, background, last, line, out):
-    """One channel of a ray's colour as a form (design.md, H7); ``last``, ``background``: see `interval_colors`.
+    """Write one channel of a ray's colour as a form (design.md, H7); ``last``, ``background``: see `interval_colors`.
 
     ``colors`` [N, n + 4] are forms with the symbols of the samples' starts and ends, and radii; ``out`` [n + 3]
     receives the centre, pose symbols, and the radius in the last place.
@@ -137,7 +137,7 @@ def form_color(light, count, colors, background, last, line, out):
 
 @njit(cache=True, error_model="numpy", **UNCOUNTED)
 def form_bounds(form, line):
-    """Bounds of what `form_color` makes; all numbers where it is not finite."""
+    """Return bounds of a form of `form_color`; infinite ones where it is not finite."""
     n = form.shape[0] - 3
     low, high = pose_range(form, line, n)
     rest = form[n + 2] + HASH_LIGHT_ROUNDING * (abs(low) + abs(high) + abs(form[0]))

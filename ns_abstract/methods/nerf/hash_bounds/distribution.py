@@ -1,4 +1,4 @@
-"""Places of the samples of the next round: quantiles of the light that each interval takes (design.md, H6).
+"""Positions of the samples of the next round: quantiles of the intervals' weights (docs/dev/design.md, H6).
 
 ``light`` is a `Light`, ``count`` the number N of its intervals, ``line`` as in `forms`.
 """
@@ -24,7 +24,7 @@ from ns_abstract.methods.nerf.render import HISTOGRAM_PADDING
 
 @njit(cache=True, error_model="numpy", **UNCOUNTED)
 def _excess(light, count, k, share, line, out):
-    """``share D - 1 + A_k - a k``: how far the share of the distribution is beyond edge k, times D (design.md, H6).
+    """Compute ``share D - 1 + A_k - a k``: D times the excess of the distribution's share beyond edge k (H6).
 
     Args:
         k: An edge.
@@ -56,7 +56,7 @@ def _excess(light, count, k, share, line, out):
 
 @njit(cache=True, error_model="numpy", **UNCOUNTED)
 def _bin(light, k, line, out):
-    """Weight and padding of bin k: pose symbols ``out`` [n + 3] of the form, its rest, and bounds."""
+    """Return weight plus padding of bin k: its form's pose symbols in ``out`` [n + 3], its rest, and bounds."""
     n = out.shape[0] - 3
     here, there = light.light[k], light.light[k + 1]
     out[0] = here[0] - there[0] + HISTOGRAM_PADDING
@@ -81,7 +81,7 @@ def _bin(light, k, line, out):
 
 @njit(cache=True, error_model="numpy", **UNCOUNTED)
 def _one_bin(light, count, edges, k, share, line, out, work):
-    """Place of an edge that surely lies in bin k (design.md, H6)."""
+    """Compute the position of an edge that surely lies in bin k (design.md, H6)."""
     n = out.shape[0] - 3
     value, weight = work[0], work[1]
     _excess(light, count, k, share, line, value)
@@ -141,7 +141,7 @@ def _one_bin(light, count, edges, k, share, line, out, work):
 
 @njit(cache=True, error_model="numpy", **UNCOUNTED)
 def _slopes_of_bins(light, edges, first, past, line, work):
-    """Least and largest slope of the places in bins ``first`` to ``past`` (exclusive)."""
+    """Return the least and largest slope of positions in bins ``first`` to ``past`` (exclusive)."""
     least, most = np.inf, 0.0
     for k in range(first, past):
         _, low, high = _bin(light, k, line, work)
@@ -153,7 +153,7 @@ def _slopes_of_bins(light, edges, first, past, line, work):
 
 @njit(cache=True, error_model="numpy", **UNCOUNTED)
 def _several_bins(light, count, edges, first, past, share, line, out, work):
-    """Place of an edge in one of several bins: from a knot on by slopes of either side (design.md, H6)."""
+    """Compute the position of an edge in one of several bins, from a knot on by slopes of either side (H6)."""
     n = out.shape[0] - 3
     value, best = work[0], np.inf
     k = first + 1
@@ -181,18 +181,15 @@ def _several_bins(light, count, edges, first, past, share, line, out, work):
 
 @njit(cache=True, error_model="numpy", **UNCOUNTED)
 def follow(light, count, edges, wanted, line, out, work):
-    """Places ``out`` of the edges of the next round (design.md, H6).
+    """Compute the positions ``out`` of the edges of the next round; return whether all are finite (design.md, H6).
 
     Args:
         light: `Light` of this round.
-        count: Its intervals.
-        edges: Theirs.
-        wanted: Edges of the next round.
-        out: `Edges`; places alone are filled in.
+        count: Its number of intervals.
+        edges: Its edges.
+        wanted: Number of edges of the next round.
+        out: `Edges`; only positions are filled in.
         work: [3, n + 3].
-
-    Returns:
-        Whether all is finite.
     """
     n, first = out.place.shape[1] - 3, 0
     scratch = work[2]
@@ -226,7 +223,7 @@ def follow(light, count, edges, wanted, line, out, work):
 
 @njit(cache=True, error_model="numpy", **UNCOUNTED)
 def _within(light, count, edges, first, past, share, line, work):
-    """Bounds of the place of an edge in the bins from ``first`` to ``past`` (exclusive)."""
+    """Return bounds of the position of an edge in the bins from ``first`` to ``past`` (exclusive)."""
     low, _, _ = _excess(light, count, first, share, line, work[0])
     _, _, high_weight = _bin(light, first, line, work[1])
     part = min(max(low / high_weight, 0.0), 1.0)

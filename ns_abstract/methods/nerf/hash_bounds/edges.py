@@ -1,4 +1,4 @@
-"""Places of the ends of intervals along a ray, and their distances (design.md, H2)."""
+"""Positions of the ends of intervals along a ray, and their distances (docs/dev/design.md, H2)."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ class Edges(NamedTuple):
     """Ends of the intervals of one round.
 
     Attributes:
-        place: [N + 1, n + 3] forms of places in the spacing, each with a place symbol of its own and no radius.
+        place: [N + 1, n + 3] forms of positions in the spacing, each with a place symbol of its own and no radius.
         low, high: [N + 1] bounds of these.
         distance: [N + 1, n + 3] forms of distances, with the same symbols.
         near, far: [N + 1] bounds of these.
@@ -36,7 +36,7 @@ class Edges(NamedTuple):
 
 
 def edges_of(count: int, n: int) -> Edges:
-    """Room for ``count`` intervals and n pose symbols."""
+    """Return memory for ``count`` intervals and n pose symbols."""
     forms = count + 1, n + 3
     return Edges(
         np.zeros(forms), np.zeros(count + 1), np.zeros(count + 1), np.zeros(forms), np.zeros(count + 1),
@@ -46,7 +46,7 @@ def edges_of(count: int, n: int) -> Edges:
 
 @njit(cache=True, error_model="numpy", **UNCOUNTED)
 def space(edges, j, spacing, line, work):
-    """Fill in the distance of edge ``j`` (design.md, H2).
+    """Fill in the distance of edge ``j`` from its position (design.md, H2).
 
     ``spacing``: whether it is piecewise; the ray's ends in its units. ``work``: [4, n + 3].
     """
@@ -95,7 +95,7 @@ def space(edges, j, spacing, line, work):
 
 @njit(cache=True, error_model="numpy", **UNCOUNTED)
 def _keep_finite(form, low, high):
-    """Replace a ``form`` by the interval from ``low`` to ``high`` where that is as good as its own rest."""
+    """Replace a ``form`` by the interval from ``low`` to ``high`` where that is no wider than the form's rest."""
     n = form.shape[0] - 3
     half = 0.5 * (high - low)
     if not abs(form[n + 1]) + form[n + 2] <= half:
@@ -107,10 +107,10 @@ def _keep_finite(form, low, high):
 
 @njit(cache=True, error_model="numpy", **UNCOUNTED)
 def middle_of(edges, i, out):
-    """The middle of interval ``i`` as a form ``out`` [n + 3] without radius.
+    """Write the middle of interval ``i`` as a form ``out`` [n + 3] without radius.
 
     Returns:
-        Shares of its place symbol that are the symbols of the interval's start and end.
+        The fractions of its place symbol that are the symbols of the interval's start and end.
     """
     a, b = edges.distance[i], edges.distance[i + 1]
     n = a.shape[0] - 3

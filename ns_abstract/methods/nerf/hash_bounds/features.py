@@ -17,11 +17,11 @@ FORM_NODES, HULL_NODES = 6, 4096
 
 
 class FeatureRoom(NamedTuple):
-    """Scratch of `level_features`, which is called so often that making it would take as long as using it.
+    """Scratch of `level_features`, which is called so often that allocating it would take as long as using it.
 
     Attributes:
         cells: [2, 3] first node and number of nodes.
-        ends: [4, 3] place, least and largest place in cells, and half of the reach.
+        ends: [4, 3] position, least and largest position in cells, and half of the range.
         nodes: [6, 6, 6, F] values at the nodes of a small box.
         kept: [2, 6, 6, 6] values on its faces.
         slopes: [2, 3] least and largest slopes.
@@ -37,7 +37,7 @@ class FeatureRoom(NamedTuple):
 
 
 def feature_room(features: int) -> FeatureRoom:
-    """Room for levels of so many ``features``."""
+    """Return scratch for levels of ``features`` features."""
     box = (FORM_NODES,) * 3
     return FeatureRoom(
         np.zeros((2, 3), np.int64), np.zeros((4, 3)), np.zeros((*box, features)), np.zeros((2, *box)), np.zeros((2, 3)),
@@ -47,13 +47,13 @@ def feature_room(features: int) -> FeatureRoom:
 
 @njit(cache=True, error_model="numpy", **UNCOUNTED)
 def hash_row(x, y, z, rows):
-    """The row of a level's table, of ``rows`` (a power of two), that the corner (x, y, z) has."""
+    """Return the row of a level's table, of ``rows`` (a power of two), of the corner (x, y, z)."""
     return (x ^ (y * PRIME_Y) ^ (z * PRIME_Z)) & (rows - 1)
 
 
 @njit(cache=True, error_model="numpy", **UNCOUNTED)
 def _gather(table, first, counts, nodes):
-    """Values ``nodes`` [6, 6, 6, F] of a level's ``table`` [2^T, F] from the corner ``first`` [3] on."""
+    """Copy values ``nodes`` [6, 6, 6, F] of a level's ``table`` [2^T, F] from the corner ``first`` [3] on."""
     for i in range(counts[0]):
         for j in range(counts[1]):
             for k in range(counts[2]):
@@ -64,7 +64,7 @@ def _gather(table, first, counts, nodes):
 
 @njit(cache=True, error_model="numpy", **UNCOUNTED)
 def _hull(table, first, counts, low, high):
-    """Least and largest value [F] of the nodes from ``first`` on."""
+    """Compute the least and largest value [F] of the nodes from ``first`` on."""
     low[:], high[:] = np.inf, -np.inf
     for i in range(counts[0]):
         for j in range(counts[1]):
@@ -77,7 +77,7 @@ def _hull(table, first, counts, low, high):
 
 @njit(cache=True, error_model="numpy", **UNCOUNTED)
 def _across(nodes, i, j, k, y, z, f):
-    """The value of a feature on the face ``i`` of nodes, at ``y`` and ``z`` from the node (j, k)."""
+    """Return the value of a feature on the face ``i`` of nodes, at ``y`` and ``z`` from the node (j, k)."""
     a = nodes[i, j, k, f] + y * (nodes[i, j + 1, k, f] - nodes[i, j, k, f])
     b = nodes[i, j, k + 1, f] + y * (nodes[i, j + 1, k + 1, f] - nodes[i, j, k + 1, f])
     return a + z * (b - a)
@@ -85,7 +85,7 @@ def _across(nodes, i, j, k, y, z, f):
 
 @njit(cache=True, error_model="numpy", **UNCOUNTED)
 def _slopes(nodes, counts, place, low, high, f, kept, slopes):
-    """The value of a feature at ``place`` and its slopes [2, 3] between there and the box (design.md, H3).
+    """Return the value of a feature at ``place``, and compute its slopes [2, 3] from there to all of the box (H3).
 
     ``nodes`` [6, 6, 6, F] are values, ``counts`` [3] of them by axis, at least 2. ``place``, ``low`` and ``high`` [3]
     are in cells from the first node on. ``slopes`` receives the least and largest; ``kept`` [2, 6, 6, 6] is scratch.
@@ -141,7 +141,7 @@ def _slopes(nodes, counts, place, low, high, f, kept, slopes):
 
 @njit(cache=True, error_model="numpy", **UNCOUNTED)
 def level_features(table, resolution, point, ranges, out, room):
-    """Forms ``out`` [F, n + 3] of one level's features at a contracted ``point`` [3, n + 3] in [0, 1] (design.md, H3).
+    """Compute forms ``out`` [F, n + 3] of one level's features at a contracted ``point`` [3, n + 3] in [0, 1] (H3).
 
     ``table`` [2^T, F] holds the level's values, ``ranges`` [2, F] their least and largest; ``resolution``: cells by
     axis.

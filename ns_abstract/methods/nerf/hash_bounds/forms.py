@@ -1,13 +1,13 @@
-"""Affine forms over a piece of a pose set and one place, for the kernels of hash-grid fields (design.md, H1).
+"""Affine forms over a sub-box of a pose set and one position on a ray, for kernels of hash-grid fields (design.md, H1).
 
-A form is an array [n + 3]: centre, coefficients of the n pose symbols, that of the place symbol, and a radius.
-Over one parameter ``p`` the pose symbols are two, ``p`` and ``2 p^2 - 1`` ("line"), so that curvature is followed;
-over more they are the parameters themselves.
+A form is an array [n + 3]: centre, coefficients of the n pose symbols, that of the place symbol, and a radius. Over one
+parameter ``p`` the pose symbols are two, ``p`` and ``2 p^2 - 1`` ("line"), so that curvature is followed; over more
+they are the parameters themselves.
 
 Kernels here are called millions of times with records of many arrays, so they are compiled without numba's counting of
-references (`UNCOUNTED`), which took half of the time and made threads wait for one another. Such a kernel makes no
-array of its own; numba refuses to compile one that would. One that does is `COUNTED`, and says so, as it would take
-over the setting of its caller.
+references (`UNCOUNTED`), which took half of the time and made threads wait for one another. Such a kernel allocates no
+array; numba refuses to compile one that would. A kernel that does is `COUNTED`, as it would otherwise inherit its
+caller's setting.
 """
 
 from __future__ import annotations
@@ -41,7 +41,7 @@ _TAYLOR_RANGE = 0.5
 
 @dataclass(frozen=True)
 class BandTuning:
-    """From where on chords are replaced by an interval. None of them decides whether a bound holds."""
+    """When chords are replaced by an interval; soundness does not depend on it."""
 
     #: Least slope of a chord of the exponential.
     flat: float = 1e-280
@@ -53,13 +53,13 @@ _FLAT, _MARGIN = BandTuning.flat, BandTuning.margin
 
 
 def form_width(dimensions: int) -> int:
-    """Pose symbols of sets with so many parameters."""
+    """Return the number of pose symbols of sets with ``dimensions`` parameters."""
     return 2 if dimensions == 1 else dimensions
 
 
 @njit(cache=True, error_model="numpy", **UNCOUNTED)
 def exp_below(x):
-    """A lower bound of ``exp(x)``; ``x`` is not NaN."""
+    """Return a lower bound of ``exp(x)``; ``x`` is not NaN."""
     if x < _LEAST:
         return 0.0
     return exp_kernel(min(x, _MOST)) * EXP_DOWN
@@ -67,7 +67,7 @@ def exp_below(x):
 
 @njit(cache=True, error_model="numpy", **UNCOUNTED)
 def exp_above(x):
-    """An upper bound of ``exp(x)``, infinite where the function may overflow."""
+    """Return an upper bound of ``exp(x)``, infinite where the function may overflow."""
     if not x < _MOST:
         return np.inf
     return exp_kernel(max(x, _LEAST)) * EXP_UP
@@ -75,7 +75,7 @@ def exp_above(x):
 
 @njit(cache=True, error_model="numpy", **UNCOUNTED)
 def pose_range(a, line, n):
-    """Least and largest value of the pose part of the form ``a``, without its centre."""
+    """Return the least and largest value of the pose part of the form ``a``, without its centre."""
     if line:
         g, q = a[1], a[2]
         low, high = q - abs(g), q + abs(g)
@@ -91,7 +91,7 @@ def pose_range(a, line, n):
 
 @njit(cache=True, error_model="numpy", **UNCOUNTED)
 def form_range(a, line):
-    """Least and largest value of the form ``a``, rounded outward."""
+    """Return the least and largest value of the form ``a``, rounded outward."""
     n = a.shape[0] - 3
     low, high = pose_range(a, line, n)
     rest = abs(a[n + 1]) + a[n + 2]
@@ -101,7 +101,7 @@ def form_range(a, line):
 
 @njit(cache=True, error_model="numpy", **UNCOUNTED)
 def spread_of(a):
-    """The sum of the absolute coefficients of a form and its radius."""
+    """Return the sum of the absolute coefficients of a form and its radius."""
     total = 0.0
     for i in range(1, a.shape[0]):
         total += abs(a[i])
@@ -169,7 +169,7 @@ def compose(a, derivatives, line, out, scratch):
 
 @njit(cache=True, error_model="numpy", **UNCOUNTED)
 def reciprocal(a, line, out, scratch):
-    """``out = 1 / a`` of a form that is above 0, else one of infinite radius."""
+    """Compute ``out = 1 / a`` for a positive form, else a form of infinite radius."""
     low, _ = form_range(a, line)
     c = a[0]
     if not low > 0.0:
@@ -183,11 +183,11 @@ def reciprocal(a, line, out, scratch):
 
 @njit(cache=True, error_model="numpy", **UNCOUNTED)
 def exp_band(center, low, high):
-    """A polynomial and a rest that enclose ``exp`` on an interval (design.md, H5).
+    """Return a polynomial and a rest that enclose ``exp`` on an interval (design.md, H5).
 
-    ``center``, ``low``, ``high``: ``low <= center <= high``. Returns v, slope, curvature, rest: ``|exp(center + t) - v
-    - slope t - curvature t^2| <= rest`` where ``center + t`` is in the interval; the curvature is not negative. All
-    infinite where the function may overflow.
+    ``low <= center <= high``. Returns v, slope, curvature, rest: ``|exp(center + t) - v - slope t - curvature t^2| <=
+    rest`` where ``center + t`` is in the interval; the curvature is not negative. All are infinite where the function
+    may overflow.
     """
     if not (high < _MOST and low <= high):
         return 0.0, 0.0, 0.0, np.inf
@@ -221,7 +221,7 @@ def sigmoid(x):
 
 @njit(cache=True, error_model="numpy", **UNCOUNTED)
 def sigmoid_band(center, low, high):
-    """Like `exp_band`, of the logistic function: value, slope, half the second derivative, and rest."""
+    """Return `exp_band` for the logistic function: value, slope, half the second derivative, and rest."""
     if not (low <= center <= high and high - low < np.inf):
         return 0.5, 0.0, 0.0, 0.5
     value, reach = sigmoid(center), max(high - center, center - low)
@@ -253,7 +253,7 @@ def sigmoid_band(center, low, high):
 
 @njit(cache=True, error_model="numpy", **UNCOUNTED)
 def apply_band(form, band, line, out):
-    """``out = f(form)`` by what `exp_band` or `sigmoid_band` returned for the form's centre and range (H5)."""
+    """Compute ``out = f(form)`` from `exp_band` or `sigmoid_band` for the form's centre and range (design.md, H5)."""
     n = form.shape[0] - 3
     value, slope, curvature, rest = band
     others = (abs(form[n + 1]) + form[n + 2]) * HASH_UP

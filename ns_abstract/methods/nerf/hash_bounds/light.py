@@ -1,4 +1,4 @@
-"""Optical depths along a ray, and the light that is left behind them (design.md, H6)."""
+"""Optical depths along a ray, and the transmittance behind them (docs/dev/design.md, H6)."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ from ns_abstract.methods.nerf.hash_bounds.forms import (
 
 
 class Light(NamedTuple):
-    """Depths of N intervals of one round, and the light that is left before and behind them.
+    """Optical depths of N intervals of one round, and the transmittance before and behind them.
 
     Attributes:
         depth: [N, n + 4] forms of optical depths; symbols are those of poses, of the interval's start and of its end.
@@ -37,9 +37,9 @@ class Light(NamedTuple):
         edges, rests: [N + 2], [N + 1] sums of the absolute ``edge`` before an edge, and of the depths' radii.
         size: [N + 1] sums of the absolute values of depths.
         bounds: [N + 1, 2] bounds of the sums.
-        light: [N + 1, 4] the light that is left at an edge, ``exp(-total)``: centre, what it loses by unit of the
-            total's deviation, coefficient of the second pose symbol (line), rest.
-        left: [N + 1, 2] bounds of the light.
+        light: [N + 1, 4] the transmittance at an edge, ``exp(-total)``: centre, loss per unit of the total's deviation,
+            coefficient of the second pose symbol (line), rest.
+        left: [N + 1, 2] bounds of the transmittance.
     """
 
     depth: np.ndarray
@@ -56,7 +56,7 @@ class Light(NamedTuple):
 
 
 def light_of(count: int, n: int) -> Light:
-    """Room for ``count`` intervals and n pose symbols."""
+    """Return memory for ``count`` intervals and n pose symbols."""
     return Light(
         np.zeros((count, n + 4)), np.zeros(count), np.zeros(count), np.zeros((count + 1, n + 3)), np.zeros(count + 1),
         np.zeros(count + 2), np.zeros(count + 1), np.zeros(count + 1), np.zeros((count + 1, 2)),
@@ -66,16 +66,16 @@ def light_of(count: int, n: int) -> Light:
 
 @njit(cache=True, error_model="numpy", **UNCOUNTED)
 def times(a, b):
-    """``a b``, 0 where ``a`` is 0 although ``b`` is infinite."""
+    """Return ``a b``, 0 where ``a`` is 0, even if ``b`` is infinite."""
     return 0.0 if a == 0.0 else a * b
 
 
 @njit(cache=True, error_model="numpy", **UNCOUNTED)
 def add_depth(edges, i, density, bounds, shares, line, light, work):
-    """Fill in interval ``i`` and its end from the form of its ``density`` (design.md, H6).
+    """Fill in interval ``i`` and its end from the form of its ``density``; return whether it is finite (design.md, H6).
 
     The intervals before it are filled in. ``density`` [n + 3] has the place symbol of the interval's middle and lies in
-    ``bounds``; ``shares`` are those of `middle_of`; ``work`` is [2, n + 4]. Returns whether anything is known.
+    ``bounds``; ``shares`` are those of `middle_of`; ``work`` is [2, n + 4].
     """
     a, b = edges.distance[i], edges.distance[i + 1]
     n = a.shape[0] - 3
@@ -119,7 +119,7 @@ def add_depth(edges, i, density, bounds, shares, line, light, work):
 
 @njit(cache=True, error_model="numpy", **UNCOUNTED)
 def begin(light):
-    """Set the light at the first edge: all of it."""
+    """Set the transmittance at the first edge to 1."""
     light.total[0] = 0.0
     light.edge[0] = light.edges[0] = light.rests[0] = light.size[0] = 0.0
     light.bounds[0] = 0.0
@@ -130,7 +130,7 @@ def begin(light):
 
 @njit(cache=True, error_model="numpy", **UNCOUNTED)
 def _add_up(light, i, line, n):
-    """Sum and light behind interval ``i``."""
+    """Compute the sum of depths and the transmittance behind interval ``i``."""
     x, total, k = light.depth[i], light.total, i + 1
     for s in range(n + 1):
         total[k, s] = total[i, s] + x[s]
@@ -184,7 +184,7 @@ def _add_up(light, i, line, n):
 
 @njit(cache=True, error_model="numpy", **UNCOUNTED)
 def give_up(light, first, count):
-    """Leave open the depths of the intervals from ``first`` on."""
+    """Leave the depths of the intervals from ``first`` on unknown."""
     n = light.depth.shape[1] - 4
     for i in range(first, count):
         light.depth[i] = 0.0
@@ -195,11 +195,11 @@ def give_up(light, first, count):
 
 @njit(cache=True, error_model="numpy", **UNCOUNTED)
 def depths_functional(light, count, k, at_end, at_start, behind, own, scale):
-    """Sum of the absolute coefficients of ``scale (at_end dS_N + at_start dS_k + behind dS_k+1) + own symbols``.
+    """Return the sum of absolute coefficients of ``scale (at_end dS_N + at_start dS_k + behind dS_k+1) + own symbols``.
 
-    dS is what a sum of depths deviates by, without its pose symbols (design.md, H6); ``k`` is an edge below N. The
-    factors are 0 where the light is an interval; ``own`` are coefficients of the symbols of the edges k and k + 1 that
-    are added.
+    dS is the deviation of a sum of depths, without its pose symbols (design.md, H6); ``k`` is an edge below N. The
+    factors are 0 where the transmittance is an interval; ``own`` are coefficients of the symbols of edges k and k + 1
+    that are added.
     """
     n = light.depth.shape[1] - 4
     start = light.depth[k - 1, n + 2] if k > 0 else 0.0

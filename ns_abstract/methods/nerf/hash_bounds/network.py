@@ -1,7 +1,7 @@
-"""Small networks over a piece of a ray's poses by zonotopes (design.md, H4).
+"""Bounds of small networks over a sub-box of a ray's poses, by zonotopes (docs/dev/design.md, H4).
 
 Rows of a matrix are the centre, the coefficients of the pose symbols and of the place symbol, and those of error
-symbols: one for every feature, and one for every ReLU of unknown sign. A radius by neuron holds what is rounded.
+symbols: one for every feature, and one for every unstable ReLU. A radius by neuron holds rounding errors.
 """
 
 from __future__ import annotations
@@ -39,7 +39,7 @@ class NetWeights(NamedTuple):
 
 
 def net_weights(net: DenseNet) -> NetWeights:
-    """The arrays of ``net`` for kernels."""
+    """Return the arrays of ``net`` for kernels."""
     sizes = np.array([net.weights[0].shape[1], *(w.shape[0] for w in net.weights)], np.int64)
     layers, inputs, outputs = len(net.weights), int(sizes[:-1].max()), int(sizes[1:].max())
     padded = -(-outputs // _PAIR) * _PAIR
@@ -52,7 +52,7 @@ def net_weights(net: DenseNet) -> NetWeights:
 
 
 class LayerZonotope(NamedTuple):
-    """Room for the neurons of one layer.
+    """Memory for the neurons of one layer.
 
     Attributes:
         rows: [most rows, most neurons].
@@ -65,13 +65,13 @@ class LayerZonotope(NamedTuple):
 
 
 def zonotope(rows: int, neurons: int) -> LayerZonotope:
-    """Room for ``rows`` of ``neurons``."""
+    """Return memory for ``rows`` of ``neurons``."""
     return LayerZonotope(np.zeros((rows, neurons)), np.zeros(neurons), np.zeros(neurons))
 
 
 @njit(cache=True, error_model="numpy", **UNCOUNTED)
 def from_features(features, weights, out):
-    """Neurons ``out`` of the first layer from forms ``features`` [F, n + 3], each with a symbol of its own.
+    """Compute neurons ``out`` of the first layer from forms ``features`` [F, n + 3], each with a symbol of its own.
 
     Returns:
         The number of rows.
@@ -104,10 +104,10 @@ def from_features(features, weights, out):
 
 @njit(cache=True, error_model="numpy", **UNCOUNTED)
 def relu(z, count, n, live):
-    """max(0, z) of ``n`` neurons in ``count`` rows, in place (design.md, H4).
+    """Compute max(0, z) of ``n`` neurons in ``count`` rows, in place (design.md, H4).
 
-    ``count``, ``n``: rows and neurons. ``live``: [n] numbers of the neurons that may be above 0; overwritten. Returns
-    the number of rows, and that of live neurons.
+    ``live``: [n] receives the numbers of the neurons that may be positive. Returns the number of rows, and that of live
+    neurons.
     """
     rows, radius, size = z.rows, z.radius, z.size
     # at first the spreads
@@ -147,10 +147,10 @@ def relu(z, count, n, live):
 
 @njit(cache=True, error_model="numpy", **UNCOUNTED)
 def linear(z, count, live, weight, absolute, bias, rounding, out, rest):
-    """Neurons ``out`` [n] of a layer, from those ``z`` of its inputs, ``count`` rows, that are ``live`` [k].
+    """Compute neurons ``out`` [n] of a layer from its inputs ``z``, of ``count`` rows, of which ``live`` [k] count.
 
     ``weight`` [inputs, n and more, to whole pairs of lines], ``absolute`` weights and ``bias`` [n and more];
-    ``rounding`` is the relative error of the layer's sums. ``out`` may hold in its radius what others add; ``rest``
+    ``rounding`` is the relative error of the layer's sums. The radius of ``out`` may hold further terms; ``rest``
     [ROWS, two lines] is scratch.
     """
     rows, radius = out.rows, out.radius
@@ -176,10 +176,10 @@ def linear(z, count, live, weight, absolute, bias, rounding, out, rest):
 
 @njit(cache=True, error_model="numpy", **UNCOUNTED)
 def remaining_layers(rooms, count, weights, live, rest):
-    """Bound the layers after the first, whose neurons before their ReLU are in ``rooms[0]``.
+    """Bound the layers after the first, whose neurons before their ReLU are in ``rooms[0]``; return the last's rows.
 
-    Returns how many rows the last layer's `LayerZonotope` has. ``rooms``: `LayerZonotope` of every layer, and more;
-    ``count``: rows of the first. ``live`` [most neurons] and ``rest`` [ROWS, two lines] are scratch.
+    ``rooms``: `LayerZonotope` of every layer, and more; ``count``: rows of the first. ``live`` [most neurons] and
+    ``rest`` [ROWS, two lines] are scratch.
     """
     for layer in range(1, weights.sizes.shape[0] - 1):
         z = rooms[layer - 1]
@@ -194,7 +194,7 @@ def remaining_layers(rooms, count, weights, live, rest):
 
 @njit(cache=True, error_model="numpy", **UNCOUNTED)
 def sizes_of(z, count):
-    """Fill in bounds of the absolute values of neurons, from ``count`` rows."""
+    """Compute bounds of the absolute values of neurons, from ``count`` rows."""
     n = z.rows.shape[1]
     for j in range(n):
         z.size[j] = 0.0
@@ -209,8 +209,8 @@ class HeadWeights(NamedTuple):
     """The network of colours.
 
     Attributes:
-        direction: [16, n] the part of the first layer that looks at harmonics, and
-        geometry, absolute: [outputs of the density's network, n and more] that which looks at the others.
+        direction: [16, n] the first layer's weights of harmonics.
+        geometry, absolute: [outputs of the density's network, n and more] its other weights, and their absolute values.
     """
 
     net: NetWeights
@@ -220,7 +220,7 @@ class HeadWeights(NamedTuple):
 
 
 def head_weights(net: DenseNet, harmonics: int) -> HeadWeights:
-    """The arrays of ``net``, whose first inputs are ``harmonics`` of the direction."""
+    """Return the arrays of ``net``, whose first inputs are ``harmonics`` of the direction."""
     weights = net_weights(net)
     first = weights.weight[0]
     inputs = int(weights.sizes[0])
@@ -231,10 +231,10 @@ def head_weights(net: DenseNet, harmonics: int) -> HeadWeights:
 
 @njit(cache=True, error_model="numpy", **UNCOUNTED)
 def weigh_direction(forms, head, rows, radius):
-    """Set ``rows`` and ``radius`` to the share of a direction in the first layer of the ``head``.
+    """Set ``rows`` and ``radius`` to the contribution of a direction to the first layer of the ``head``.
 
     It is the weighted sum of the direction's spherical harmonics ``forms`` [16, n + 3]: ``rows`` [n + 2, neurons] are
-    its linear part, ``radius`` [neurons] bounds what is not linear, and the rounding.
+    its linear part, ``radius`` [neurons] bounds the rest, and the rounding.
     """
     count, width = forms.shape
     rows[:] = 0.0
@@ -249,10 +249,10 @@ def weigh_direction(forms, head, rows, radius):
 
 @njit(cache=True, error_model="numpy", **UNCOUNTED)
 def colors(z, count, seen, head, rooms, live, rest):
-    """Neurons of colours before the sigmoid in ``rooms[-1]`` from those of the density's network; returns the rows.
+    """Compute neurons of colours before the sigmoid in ``rooms[-1]``; return the number of rows.
 
-    ``z`` is the `LayerZonotope` of the density's network, ``count`` rows; ``seen`` what `weigh_direction` made.
-    Others: see `remaining_layers`.
+    ``z`` is the `LayerZonotope` of the density's network, ``count`` rows; ``seen`` the result of `weigh_direction`. For
+    the others see `remaining_layers`.
     """
     sizes_of(z, count)
     n = z.rows.shape[1]
@@ -270,7 +270,7 @@ def colors(z, count, seen, head, rooms, live, rest):
 
 @njit(cache=True, error_model="numpy", **UNCOUNTED)
 def output_form(z, count, j, shared, out):
-    """Neuron ``j`` of ``count`` rows as a form ``out`` [shared + 1]: error symbols go to the radius."""
+    """Write neuron ``j`` of ``count`` rows as a form ``out`` [shared + 1]; error symbols are added to the radius."""
     rest = z.radius[j]
     for r in range(shared, count):
         rest += abs(z.rows[r, j])

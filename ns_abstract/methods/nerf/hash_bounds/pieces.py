@@ -1,4 +1,4 @@
-"""Bounds of one ray over a piece of a pose set, round by round, and halving of pieces (design.md, H6 to H8)."""
+"""Bounds of one ray over a sub-box of a pose set, round by round, and halving of sub-boxes (design.md, H6 to H8)."""
 
 from __future__ import annotations
 
@@ -91,10 +91,10 @@ class PieceRoom(NamedTuple):
 
     Attributes:
         work: [24, n + 3] and [2, n + 4] forms.
-        ray: Forms [3, n + 3] of the origin and direction, and what `quotients` makes.
-        directions: [16, n + 3] harmonics, and what the first layer makes of them.
+        ray: Forms [3, n + 3] of the origin and direction, and the results of `quotients`.
+        directions: [16, n + 3] harmonics, and their contribution to the first layer.
         features: [features, n + 3] of the widest encoding.
-        levels: Of one level of it.
+        levels: Scratch of one level of it.
         edges, light: Of every round.
         rooms: Neurons of density networks by round, of as many layers for each; ``head``: of the network of colours.
         colors: [N, 3, n + 4] forms, [2, N, 3] bounds, and as many numbers of scratch.
@@ -132,10 +132,10 @@ class RayPolynomials(NamedTuple):
 
 
 class WorkLimits(NamedTuple):
-    """What decides about work alone.
+    """Limits of the work; soundness does not depend on them.
 
     Attributes:
-        dark: Light below which samples are left open, in rounds that place samples and in the last one.
+        dark: Transmittance below which samples are left open, in rounds that place samples and in the last one.
         dim: Weight below which colours are left open.
     """
 
@@ -145,7 +145,7 @@ class WorkLimits(NamedTuple):
 
 @njit(cache=True, error_model="numpy", nogil=True, **UNCOUNTED)
 def density_of(field, place, line, rooms, room, out):
-    """The form of a density's logarithm at contracted ``place`` [3, n + 3]; returns the rows of its network.
+    """Compute the form of a density's logarithm at contracted ``place`` [3, n + 3]; return the rows of its network.
 
     Args:
         place: Forms.
@@ -166,7 +166,7 @@ def density_of(field, place, line, rooms, room, out):
 
 @njit(cache=True, error_model="numpy", nogil=True, **UNCOUNTED)
 def _sample(field, edges, light, i, line, rooms, room):
-    """Fill in the depth of interval ``i`` of a round; returns whether something is known, and the network's rows."""
+    """Compute the depth of interval ``i`` of a round; return whether it is finite, and the network's rows."""
     work, wide = room.work
     distance, value, out, place = work[0], work[1], work[2], work[3:6]
     shares = middle_of(edges, i, distance)
@@ -189,7 +189,7 @@ def _sample(field, edges, light, i, line, rooms, room):
 
 @njit(cache=True, error_model="numpy", nogil=True, **UNCOUNTED)
 def _color(field, edges, i, count, line, rooms, room):
-    """Fill in the colours of sample ``i`` from ``count`` rows of the density's network."""
+    """Compute the colours of sample ``i`` from ``count`` rows of the density's network."""
     forms, bounds, _ = room.colors
     work = room.work[0]
     distance, value, out = work[0], work[1], work[2]
@@ -222,7 +222,7 @@ def _color(field, edges, i, count, line, rooms, room):
 
 @njit(cache=True, error_model="numpy", nogil=True, **UNCOUNTED)
 def _round(field, edges, light, count, dark, line, rooms, room):
-    """Depths of a round that places samples; returns whether something is known."""
+    """Compute the depths of a round that places samples; return whether they are finite."""
     begin(light)
     for i in range(count):
         bounded, _ = _sample(field, edges, light, i, line, rooms, room)
@@ -236,7 +236,7 @@ def _round(field, edges, light, count, dark, line, rooms, room):
 
 @njit(cache=True, error_model="numpy", nogil=True, **UNCOUNTED)
 def _start(rays, ray, middle, half, field, line, room):
-    """Forms of a ray over a piece, the first edges, and what the head makes of the direction."""
+    """Compute forms of a ray over a sub-box, the first edges, and the direction's contribution to the head."""
     origin, direction, ratios, shifts, along = room.ray
     for a in range(3):
         line_form(rays.origin[:, a], rays.exponents, rays.origin_radius[a], middle, half, line, origin[a])
@@ -259,16 +259,16 @@ def _start(rays, ray, middle, half, field, line, room):
 
 @njit(cache=True, error_model="numpy", nogil=True, **UNCOUNTED)
 def bound_piece(field, rays, ray, middle, half, limits, room, out, shown):
-    """Bounds ``out`` [2, 3] of a ray's colour over the box ``middle`` +- ``half`` [d] (design.md, H6, H7).
+    """Compute bounds ``out`` [2, 3] of a ray's colour over the box ``middle`` +- ``half`` [d] (design.md, H6, H7).
 
     Args:
         ray: Number of the ray.
         middle, half: [d] in [-1, 1].
-        out: [2, 3]; overwritten: [0, 1] where nothing is known.
-        shown: [3, n + 3] forms of the colours (`composition.form_color`), of infinite radius where nothing is known.
+        out: [2, 3]; overwritten: [0, 1] where no bound is known.
+        shown: [3, n + 3] forms of the colours (`composition.form_color`), of infinite radius where none is known.
 
     Returns:
-        Whether something is known: the light and colours of the samples in ``room``.
+        Whether bounds are known; ``room`` then has the light and colours of the samples.
     """
     out[0], out[1] = 0.0, 1.0
     shown[:] = 0.0
@@ -317,7 +317,7 @@ def bound_piece(field, rays, ray, middle, half, limits, room, out, shown):
 
 @njit(cache=True, error_model="numpy", nogil=True, **UNCOUNTED)
 def _longest_axis(rays, ray, half):
-    """The axis along which points move most."""
+    """Return the axis along which points move most."""
     terms, d = rays.exponents.shape
     best, axis = -1.0, 0
     for k in range(d):
@@ -333,7 +333,7 @@ def _longest_axis(rays, ray, half):
 
 @njit(cache=True, error_model="numpy", nogil=True, **UNCOUNTED)
 def _on_part(form, line, low, high):
-    """Bounds of a ``form`` where its parameters lie between ``low`` and ``high`` [d] in [-1, 1]."""
+    """Return bounds of a ``form`` over parameters between ``low`` and ``high`` [d] in [-1, 1]."""
     n = form.shape[0] - 3
     rest = form[n + 2]
     if not rest < np.inf:
@@ -359,10 +359,10 @@ def _on_part(form, line, low, high):
 
 @njit(cache=True, error_model="numpy", nogil=True, **COUNTED)
 def _keep(out, counts, place, cells, found, shown, line, low, high):
-    """Unite the bounds of a piece with those ``out`` [parts, 2, 3] of all parts that it meets.
+    """Unite the bounds of a sub-box with those ``out`` [parts, 2, 3] of all parts that it meets.
 
-    ``counts`` [d] are parts by axis; the piece is number ``place`` of ``cells`` [d] by axis; ``found`` and ``shown``
-    are what `bound_piece` made; ``low`` and ``high`` [d] are scratch.
+    ``counts`` [d] are parts by axis; the sub-box is number ``place`` of ``cells`` [d] by axis; ``found`` and ``shown``
+    are results of `bound_piece`; ``low`` and ``high`` [d] are scratch.
     """
     d = counts.shape[0]
     first, past, at = np.empty(d, np.int64), np.empty(d, np.int64), np.empty(d, np.int64)
@@ -397,19 +397,19 @@ def _keep(out, counts, place, cells, found, shown, line, low, high):
 
 @njit(cache=True, error_model="numpy", nogil=True, **COUNTED)
 def bound_ray(field, rays, ray, cells, deepest, most, goal, limits, shifts, room, counts, out):
-    """Write bounds of a ray over each part of the box, from sub-boxes halved until they are good (design.md, H8).
+    """Compute bounds of a ray over each part of the box, from sub-boxes halved until they are tight (design.md, H8).
 
     Args:
         field, rays, ray, limits, room: See `bound_piece`.
         cells: [d] first sub-boxes by axis.
-        deepest, most: Halvings of one of these, and sub-boxes in all.
-        goal: [3, 3] by channel: a sub-box is good with bounds between the first two, or a radius below the third.
-        shifts: [s, 2, 2] intervals of hue and saturation that are added to the samples' colours; none: they stay.
+        deepest, most: Largest number of halvings of one of these, and of sub-boxes in all.
+        goal: [3, 3] by channel: a sub-box is tight with bounds between the first two, or a radius below the third.
+        shifts: [s, 2, 2] intervals of hue and saturation that are added to the samples' colours; empty: none.
         counts: [d] parts by axis.
         out: [s or 1, parts, 2, 3] bounds by shift; overwritten.
 
     Returns:
-        The number of first sub-boxes, of those that were bounded, and of those that were not halved.
+        The number of first sub-boxes, of bounded ones, and of those that were not halved.
     """
     d = cells.shape[0]
     first = 1
@@ -473,6 +473,6 @@ def bound_ray(field, rays, ray, cells, deepest, most, goal, limits, shifts, room
 
 @njit(cache=True, error_model="numpy", nogil=True, **COUNTED)
 def bound_rays(field, rays, cells, deepest, most, goal, limits, shifts, room, counts, out, pieces):
-    """`bound_ray` of r rays: ``cells`` [r, d], ``goal`` [r, 3, 3], ``out`` [r, ., parts, 2, 3], ``pieces`` [r, 3]."""
+    """Call `bound_ray` of r rays: ``cells`` [r, d], ``goal`` [r, 3, 3], ``out`` [r, ., parts, 2, 3], `pieces` [r, 3]."""
     for k in range(cells.shape[0]):
         pieces[k] = bound_ray(field, rays, k, cells[k], deepest, most, goal[k], limits, shifts, room, counts, out[k])

@@ -1,4 +1,4 @@
-"""Rays of a piece of a pose set, and contracted points on them, as forms (design.md, H1, H2)."""
+"""Rays of a sub-box of a pose set, and contracted points on them, as forms (docs/dev/design.md, H1, H2)."""
 
 from __future__ import annotations
 
@@ -22,10 +22,10 @@ _ALONG = 0.25
 
 @njit(cache=True, error_model="numpy", **UNCOUNTED)
 def line_form(coefficients, exponents, radius, middle, half, line, out):
-    """The polynomial ``sum_a c_a p^a`` on the box ``middle + half q`` as a form ``out`` of ``q`` (design.md, H1).
+    """Write the polynomial ``sum_a c_a p^a`` on the box ``middle + half q`` as a form ``out`` of ``q`` (design.md, H1).
 
-    ``coefficients`` [M], ``exponents`` [M, d]; the polynomial is off by ``radius``. ``middle`` and ``half`` [d] are
-    inside of [-1, 1]; ``line``: one parameter, so that second-order terms are followed.
+    ``coefficients`` [M], ``exponents`` [M, d]; the polynomial's error is at most ``radius``. ``middle`` and ``half``
+    [d] are inside of [-1, 1]; ``line``: one parameter, so that second-order terms are followed.
     """
     terms, d = exponents.shape
     out[:] = 0.0
@@ -68,7 +68,7 @@ def line_form(coefficients, exponents, radius, middle, half, line, out):
 
 @njit(cache=True, error_model="numpy", **UNCOUNTED)
 def harmonics(direction, line, out, work):
-    """The 16 harmonics ``out`` of ``(direction + 1) / 2`` as forms (``components_from_spherical_harmonics``).
+    """Compute the 16 harmonics ``out`` of ``(direction + 1) / 2`` as forms (``components_from_spherical_harmonics``).
 
     ``direction`` [3, n + 3], ``out`` [16, n + 3] and ``work`` [9, n + 3] are forms.
     """
@@ -124,10 +124,10 @@ def _negate(a, out):
 
 @njit(cache=True, error_model="numpy", **UNCOUNTED)
 def quotients(origin, direction, line, ratios, shifts, along, work):
-    """Forms by which far points are followed, by axis j: ``d_i / d_j`` and ``o_i - o_j d_i / d_j`` (design.md, H2).
+    """Compute the forms ``d_i / d_j`` and ``o_i - o_j d_i / d_j`` by axis j, by which far points are followed (H2).
 
     ``origin`` and ``direction`` are [3, n + 3]; ``ratios`` and ``shifts`` [3 (j), 3 (i), n + 3] and ``along`` [3],
-    whether those of an axis are made, are overwritten; ``work`` is [4, n + 3].
+    whether those of an axis are computed, are overwritten; ``work`` is [4, n + 3].
     """
     inverse, product = work[0], work[1]
     for j in range(3):
@@ -150,7 +150,7 @@ def quotients(origin, direction, line, ratios, shifts, along, work):
 
 @njit(cache=True, error_model="numpy", **COUNTED)
 def _hull_of_slopes(low, high, jacobian):
-    """Slopes [2, 3, 3] of the contraction, least and largest over a box (design.md, H2)."""
+    """Return slopes [2, 3, 3] of the contraction, least and largest over a box (design.md, H2)."""
     nearest, least_of_all = np.empty(3), 0.0
     for i in range(3):
         nearest[i] = max(0.0, low[i], -high[i])
@@ -197,7 +197,7 @@ def _hull_of_slopes(low, high, jacobian):
 
 @njit(cache=True, error_model="numpy", **COUNTED)
 def contracted(x):
-    """[3] nerfstudio's contraction of a point [3] by the maximum norm."""
+    """Return nerfstudio's contraction [3] of a point [3] by the maximum norm."""
     m = max(abs(x[0]), abs(x[1]), abs(x[2]))
     if m < 1.0:
         return x.copy()
@@ -206,7 +206,7 @@ def contracted(x):
 
 @njit(cache=True, error_model="numpy", **COUNTED)
 def _at_kinks(x, low, high, out):
-    """Contraction of the forms ``x`` [3, n + 3] over a box on which it has kinks: a mean-value form."""
+    """Compute the contraction of the forms ``x`` [3, n + 3] over a box on which it has kinks: a mean-value form."""
     width = x.shape[1]
     jacobian = np.empty((2, 3, 3))
     _hull_of_slopes(low, high, jacobian)
@@ -226,7 +226,7 @@ def _at_kinks(x, low, high, out):
 
 @njit(cache=True, error_model="numpy", **UNCOUNTED)
 def _largest(x, axis, positive, room, line, difference):
-    """Whether the coordinate ``axis`` surely is the largest of the forms ``x`` [3, n + 3] in size, by ``room``."""
+    """Return whether coordinate ``axis`` of the forms ``x`` [3, n + 3] is surely the largest, by ``room``."""
     sign = 1.0 if positive else -1.0
     for i in range(3):
         if i != axis:
@@ -241,10 +241,10 @@ def _largest(x, axis, positive, room, line, difference):
 
 @njit(cache=True, error_model="numpy", **UNCOUNTED)
 def point(ray, distance, line, out, work):
-    """Contracted point ``out`` at ``distance`` as forms of ``(v + 2) / 4`` in [0, 1]^3 (design.md, H2).
+    """Compute the contracted point ``out`` at ``distance`` as forms of ``(v + 2) / 4`` in [0, 1]^3 (design.md, H2).
 
-    ``ray``: origin and direction [3, n + 3], and what `quotients` makes of them; ``distance`` [n + 3] has the place
-    symbol; ``work`` is [13, n + 3]. Returns whether the point surely lies inside of (0, 1)^3.
+    ``ray``: origin and direction [3, n + 3], and the results of `quotients`; ``distance`` [n + 3] has the place symbol;
+    ``work`` is [13, n + 3]. Returns whether the point surely lies inside of (0, 1)^3.
     """
     origin, direction, ratios, shifts, along = ray
     x, t = work[:3], work[3]
@@ -289,7 +289,7 @@ def point(ray, distance, line, out, work):
 
 @njit(cache=True, error_model="numpy", **UNCOUNTED)
 def _outside(axis, positive, origin, ratios, shifts, along, x, line, out, work):
-    """Contraction where the coordinate ``axis`` is the largest and above 1 in size (design.md, H2)."""
+    """Compute the contraction where coordinate ``axis`` is the largest and above 1 in magnitude (design.md, H2)."""
     m, inverse, square, factor, rest, scratch = work[0], work[1], work[2], work[3], work[4], work[5:7]
     sign = 1.0 if positive else -1.0
     nothing = work[7]
