@@ -307,7 +307,7 @@ class CellSearch(Generic[P]):
         return document
 
     def _ended(self, kind: type[BaseException] | None, *_error: object) -> None:
-        """Say of the last report, if it could not be brought up to date, that the search has ended."""
+        """Mark the last written report as interrupted if an exception (``kind``) ended the search."""
         if kind is not None:
             with suppress(InputError):
                 self.last.interrupted()

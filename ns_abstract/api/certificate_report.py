@@ -220,7 +220,7 @@ class CertificateReport:
 
 
 def _image_at(file: Path, pose: np.ndarray) -> np.ndarray | None:
-    """The image of a stored counterexample, if it is that of ``pose``; None also where others have changed the file."""
+    """[H, W, 3] image of a stored counterexample; None if the file is unreadable, malformed or of another pose."""
     try:
         with open_archive(file, "counterexample", "") as stored:
             shape, kind = stored.declared["image"]
@@ -233,12 +233,12 @@ def _image_at(file: Path, pose: np.ndarray) -> np.ndarray | None:
 
 
 def _depth(row: Mapping[str, Any]) -> float:
-    """The margin of a counterexample; what is no number is worse than all."""
+    """Key that sorts falsified cells, worst first: the margin, or -inf where no margin is stored."""
     return -np.inf if row["margin"] is None else row["margin"]
 
 
 def _worst(rows: list[dict[str, Any]]) -> list[dict[str, Any]]:
-    """Falsified cells, worst first; neighbours may share their counterexample, which counts once."""
+    """Rows of falsified cells by rising margin; only the worst of those that share a counterexample is kept."""
     broken = sorted((row for row in rows if row["verdict"] == "falsified"), key=_depth)
     return list({tuple(row["counterexample"]): row for row in reversed(broken)}.values())[::-1]
 

@@ -60,7 +60,7 @@ class Audit:
         return 3 if self.proved < _ENOUGH * self.claims or not self.claims else 0
 
     def _tally(self, found: list[ClaimOutcome]) -> None:
-        """Counts what came of the claims."""
+        """Sets the counts of proved, refuted and unsettled claims from ``found``, the outcome of every claim."""
         self.claims, self.proved = len(found), sum(o.verdict is True for o in found)
         self.refuted, self.unsettled = (sum(o.verdict is v for o in found) for v in (False, None))
         self.float32 = sum(o.verdict is True and o.float32 for o in found)

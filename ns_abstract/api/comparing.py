@@ -173,7 +173,7 @@ class ComparisonJob(Job):
 
 @contextmanager
 def _named(other: Scene) -> Iterator[None]:
-    """Names the file of an error as B's."""
+    """Context that adds B's file to any InputError raised inside."""
     try:
         yield
     except InputError as error:
@@ -207,7 +207,7 @@ def _check_comparable(scene: Scene, other: Scene, pose_sets: Sequence[PoseBox]) 
 
 
 def _same_frame(first: DataparserTransform, second: DataparserTransform) -> bool:
-    """Whether both runs put every point of the data set at the same place, but for rounding of their files."""
+    """Whether two runs scale, turn and shift the data set equally up to the tolerance `_TUNING.same_frame`."""
     turns, shifts = zip(*((f.matrix[:, :3] * f.scale, f.matrix[:, 3] * f.scale) for f in (first, second)), strict=True)
     # of a data set far from its origin the shift is long beside rotation and scale, which have a tolerance of their own
     sizes = first.scale, float(np.abs(turns[0]).max()), max(first.scale, float(np.abs(shifts[0]).max()))
@@ -216,7 +216,7 @@ def _same_frame(first: DataparserTransform, second: DataparserTransform) -> bool
 
 
 def _frame_choice(scene: Scene, other: Scene) -> Assumption:
-    """What says that both scenes are in one frame."""
+    """The assumption that scenes A and B share one world frame, and its evidence: equal transforms, or the default."""
     if scene.run_frame is not None and other.run_frame is not None:
         return Assumption("frame of the other scene", "A's", "equal dataparser_transforms.json")
     without = [name for name, s in (("A", scene), ("B", other)) if s.run_frame is None]

@@ -103,7 +103,7 @@ def _end(worker: subprocess.Popen[bytes]) -> None:
 
 
 def _latest(line: Connection, before: int) -> int:
-    """The last number that a worker has sent."""
+    """The newest number waiting on ``line``, without blocking; ``before`` if there is none or it is closed."""
     with suppress(EOFError, OSError):
         while line.poll():
             before = int(line.recv())

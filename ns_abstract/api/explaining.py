@@ -82,7 +82,7 @@ def explain(job: Job, index: int, result: FrameResult, seed: int = 0) -> Explana
     leaves, frame = result.leaves, job.method.frame(job.pose_sets[index])
     over = np.asarray(result.upper, np.float64) - result.lower
     over -= np.asarray(result.witness_upper, np.float64) - result.witness_lower
-    tiles = [_mean(frame, over, tile) for tile in range(frame.tile_count)]
+    tiles = [_tile_sum(frame, over, tile) for tile in range(frame.tile_count)]
     excess, gap = float(over.mean()), float((result.upper.astype(np.float64) - result.lower).mean())
     total = sum(tiles)
     if leaves is None or not leaves.tile.size or not total > 0.0:
@@ -105,13 +105,13 @@ def explain(job: Job, index: int, result: FrameResult, seed: int = 0) -> Explana
 
 
 def _extent(frame: Frame, tile: int) -> tuple[int, int, int, int]:
-    """First and past row, first and past column of a tile's pixels in the picture."""
+    """Pixels of a tile: first row, row after the last, first column, column after the last; clipped to the picture."""
     row, column = (frame.side * n for n in divmod(tile, frame.across))
     return row, min(row + frame.side, frame.camera.height), column, min(column + frame.side, frame.camera.width)
 
 
-def _mean(frame: Frame, values: np.ndarray, tile: int) -> float:
-    """Sum over a tile's pixels."""
+def _tile_sum(frame: Frame, values: np.ndarray, tile: int) -> float:
+    """Sum (not the mean) of ``values`` [H, W, ...] over the pixels of a tile."""
     top, bottom, left, right = _extent(frame, tile)
     return float(values[top:bottom, left:right].sum())
 

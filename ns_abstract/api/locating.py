@@ -122,7 +122,7 @@ class LocationQuestion(CellQuestion[LocateProgress]):
         return LocateProgress(left, min(best, default=None), store.seconds, done)
 
     def _excess(self, frame: int) -> float:
-        """Volume of what is searched for a set, as a multiple of the set's."""
+        """Volume of the box that is searched for pose set ``frame``, divided by the volume of the set's own box."""
         searched, own = self.sets[frame], self.job.job.pose_sets[frame].box
         return float(np.prod(np.subtract(searched.upper, searched.lower) / np.subtract(own.upper, own.lower)))
 
@@ -159,7 +159,7 @@ class LocationQuestion(CellQuestion[LocateProgress]):
 
 
 def _more(job: Location) -> dict[str, Any]:
-    """What report.json says of brightness and calibration, where they were asked for."""
+    """Entries of report.json: `brightness` unless it is fixed, and `calibration` if there was one."""
     brightness = job.photo.brightness
     more: dict[str, Any] = {} if brightness.still else {"brightness": vars(brightness)}
     return more if job.calibration is None else {**more, "calibration": job.calibration.describe()}
@@ -278,7 +278,7 @@ def locate(
 
 
 def _ends(value: Any) -> Any:
-    """An array's numbers as a sequence; other values as they are."""
+    """``value`` as (nested) lists if it is an array, for JSON; any other value unchanged."""
     return value.tolist() if isinstance(value, np.ndarray) else value
 
 

@@ -305,7 +305,7 @@ def calibrate(
 
 
 def _noise(residuals: np.ndarray, part: float) -> float:
-    """The least noise, in steps of 1e-4, at which ``residuals`` [n], falling, are explained but for a part of them."""
+    """Noise, rounded up to 1e-4, that ``residuals`` [n] (largest first) stay within, but for a fraction ``part``."""
     allowed = math.floor(part * residuals.size)
     return 0.0 if allowed >= residuals.size else math.ceil(float(residuals[allowed]) * 1e4) / 1e4
 

@@ -78,7 +78,7 @@ class LoopJob:
         return TubeBuilder(self.loop, view, ControlBounds(self.model, self.loop.control), dependence, views=self._seen)
 
     def _views(self, poses: PoseBox) -> tuple[PropertyView, ...]:
-        """What the properties of the picture are read off, from the poses of a set.
+        """Views by which the loop's picture properties are evaluated over the poses of a set, one per property.
 
         Raises:
             InputError: A selection picks nothing, or a region reaches beyond the picture.

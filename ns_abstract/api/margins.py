@@ -52,7 +52,7 @@ class Margins:
             self._told(self.found[-1])
 
     def _remembered(self, kind: VariationKind) -> ProveCell:
-        """Settles what the store does not hold yet."""
+        """Returns a cell prover for variations of ``kind`` that reads outcomes from the store, and stores new ones."""
         prove = self._prover(kind)
 
         def remembered(radius: float, frame: int, box: ParameterBox) -> CellOutcome:

@@ -103,12 +103,12 @@ class KnownBoxes:
         return self._inside(box, self._about(box))
 
     def _inside(self, box: ParameterBox, box_bounds: KnownBox) -> NearbyPictures:
-        """Pictures of cells inside of a box."""
+        """Pictures of cells inside ``box``, built on its known bounds and on draws of its unsettled pixels."""
         draws = self._drawn(box, box_bounds)
         return NearbyPictures(self._pictures, self._weights, box_bounds, draws, self._measures, self._motion)
 
     def _about(self, box: ParameterBox) -> KnownBox:
-        """What is known of a box, itself inside of one of which this is known."""
+        """Known bounds of ``box``, from those of its enclosing shared box, if any; cached within `_TUNING.memory`."""
         if box not in self._known:
             around = shared_box(box, self._pictures.box, self._motion)
             if around is None:
@@ -124,7 +124,7 @@ class KnownBoxes:
         return self._known[box]
 
     def _drawn(self, box: ParameterBox, box_bounds: KnownBox) -> tuple[Draw, ...]:
-        """By frame of weights, what draws the pixels of a box that are not settled."""
+        """By frame of weights, a `Draw` of the unsettled pixels of ``box``; the latest boxes are cached."""
         if box not in self._draws:
             pairs = list(zip(self._weights, box_bounds.elements or (), strict=False))
             draws = tuple(frame.drawn_alone(one.context, one.tiles, one.pixels) for (frame, _), one in pairs)

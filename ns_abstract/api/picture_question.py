@@ -234,7 +234,7 @@ class PlanePictures(FramePictures):
 
     @cached_property
     def _boxes(self) -> KnownBoxes | None:
-        """What is known of boxes around cells; None where more than weights of one scene is read, or rays are drawn."""
+        """Cached bounds of boxes around cells; None unless only one scene's `ElementFrame` weights are read."""
         weights = [(frame, channels) for frame, channels in self.weights if isinstance(frame, ElementFrame)]
         if not self._dark or len(weights) < len(self.weights):
             return None

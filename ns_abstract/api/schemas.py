@@ -29,7 +29,7 @@ _TEXT: Schema = {"type": "string", "minLength": 1}
 
 
 def _object(keys: Mapping[str, Schema], required: Iterable[str] = (), **more: Any) -> Schema:
-    """An object with these keys and no other."""
+    """JSON schema of an object that has the ``required`` keys, and no key besides ``keys``."""
     return {
         "type": "object", "properties": dict(keys), "required": list(required), "additionalProperties": False, **more
     }  # fmt: skip
@@ -44,7 +44,7 @@ def _numbers(count: int, **more: Any) -> Schema:
 
 
 def _fields(names: Iterable[str], schemas: Mapping[str, Schema]) -> dict[str, Schema]:
-    """The schema of each key that a reader knows; one without an entry here may hold anything."""
+    """JSON schema by key, for all ``names``; a name that ``schemas`` lacks accepts any value."""
     return {name: schemas.get(name, {}) for name in names}
 
 

@@ -76,7 +76,7 @@ def grown(poses: PoseBox, hull: Mapping[str, Range], motion: Mapping[str, Range]
 
 
 def _along_path(sets: Mapping[int, PoseBox]) -> bool:
-    """Whether a camera may leave one set for another: they are segments of one path."""
+    """Whether any set has the parameter `segment`: sets are then segments of one path, and a camera may change sets."""
     return any("segment" in poses.box.names for poses in sets.values())
 
 
@@ -213,7 +213,7 @@ class PhotoSequence:
         return self._write("interrupted" if self.entries[-1]["state"] == "interrupted" else "done")
 
     def _sets(self, k: int) -> dict[int, PoseBox]:
-        """By number, the set of photo ``k``."""
+        """Pose sets, by number, searched for photo ``k``: those given, or what photo k - 1 and the motion leave."""
         if k == 0:
             return self.sets
         return following(self.reached, self.entries[k - 1]["frames"], self.ranges)

@@ -176,7 +176,7 @@ def complaint(text: str) -> str:
 
 
 def _named(lines: list[str]) -> list[str]:
-    """Options that lines begin with; their help stands below them, further in."""
+    """Names of the options in lines of a help page: those at line starts with the least indentation."""
     matches = [match for line in lines if (match := re.match(r"( +)(--?[a-z][\w-]*)", line))]
     outermost = min((len(match[1]) for match in matches), default=0)
     return [match[2] for match in matches if len(match[1]) == outermost]

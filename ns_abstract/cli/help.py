@@ -64,7 +64,7 @@ def _plain(hint: Any) -> Any:
 
 
 def _value(hint: Any, flags: bool = True) -> str:
-    """What follows an option, in words; "" after a flag, where ``flags`` take no value."""
+    """Placeholder of an option's value in help, from its type ``hint``; "" for a bool if ``flags`` take no value."""
     hint = _plain(hint)
     parts = get_args(hint)
     if get_origin(hint) is Literal:

@@ -191,13 +191,13 @@ def _run_record(job: Job, options: Render | Compare, frames: tuple[int, ...], pr
 
 
 def _leaf_bytes(job: Job) -> int:
-    """Bytes of the linear sets of one cell of the first frame."""
+    """Bytes of the float32 linear sets of one cell of the first frame; 0 for a job that bounds rays."""
     camera, box = job.pose_sets[0].camera, job.pose_sets[0].box
     return 0 if job.rays else camera.width * camera.height * 3 * 2 * (box.dimensions + 1) * 4
 
 
 def _fits(leaves: Leaves | None) -> bool:
-    """Whether linear sets are few enough to be stored without being asked for."""
+    """Whether linear sets exist and take at most `_SMALL_LEAVES` bytes, so that they are stored by default."""
     return leaves is not None and sum(getattr(leaves, name).nbytes for name in vars(leaves)) <= _SMALL_LEAVES
 
 

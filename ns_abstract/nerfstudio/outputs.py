@@ -229,7 +229,7 @@ class AbstractOutputs(_Base):
             self._redraw()
 
     def _current(self) -> bool:
-        """Whether the panel tells what the background does, or nobody looks."""
+        """Whether the panel needs no update: no or the current status reported, bounding off, or nobody watching."""
         reported, now = self.abstract.reported, self._background.status
         return reported in (None, now) or now.state == "off" or not self.abstract.control.watched
 

@@ -296,7 +296,7 @@ def _within(file: Path, folder: Path) -> bool:
 
 
 def _outside(run: Path | None) -> Path:
-    """A folder for views that is not the run's: the working directory, or that of temporary files."""
+    """Folder to write views to: the working directory, or the temporary one if that lies within ``run``."""
     here = Path()
     return Path(tempfile.gettempdir()) if run is not None and _within(here, run) else here
 

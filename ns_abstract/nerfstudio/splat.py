@@ -56,7 +56,7 @@ class AbstractSplatfactoModel(AbstractOutputs, SplatfactoModel):
         self.config = config
 
     def _splats(self) -> tuple[SplatScene, Splats]:
-        """The Gaussians of the current parameters, as stored and activated."""
+        """The model's current Gaussians, as a scene and activated; kept until parameters or the step change."""
         state = tuple((id(value), value._version) for value in self.gauss_params.values())
         if self._active is None or self._active[0] != (state, self.step):
             plain = self.config.sh_degree == 0
@@ -77,7 +77,7 @@ class AbstractSplatfactoModel(AbstractOutputs, SplatfactoModel):
 
     @property
     def _rules(self) -> Rasteriser:
-        """What is drawn and bounded: the version that was asked for, or the installed one's."""
+        """Rasteriser that is drawn and bounded: that of `gsplat_version`, if set, else of the installed gsplat."""
         version = self.config.abstract.gsplat_version
         return installed_gsplat() if version is None else VERSIONS[version]
 

@@ -229,7 +229,7 @@ class Background:
         return True
 
     def _is_wanted(self, key: _Key, view: ViewRequest) -> bool:
-        """Whether the newest request answers this one as well."""
+        """Whether the newest request has the same ``key``, and pictures at least as large as those of ``view``."""
         return self._wanted is not None and self._wanted[1] == key and self._wanted[2].side >= view.side
 
     def _ask(self, key: _Key, view: ViewRequest, seconds: float, known: int) -> None:
@@ -246,7 +246,7 @@ class Background:
     # --- workers -------------------------------------------------------------------------------
 
     def _start_missing_workers(self) -> None:
-        """Start the workers that are missing: one, and those in reserve."""
+        """Start workers, with the scene loaded, until there are one and `_reserve` more; none once closed."""
         while not self._closed and self._source is not None and len(self._workers) < 1 + self._reserve:
             worker = _Process(self._take)
             worker.post(("scene", *self._source))

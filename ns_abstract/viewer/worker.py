@@ -67,7 +67,7 @@ class BoundsWorker:
                 self.connection.send(("error", number, f"{type(error).__name__}: {error}"))
 
     def _next(self) -> tuple[Any, ...]:
-        """The oldest scene, or the newest request once no other follows."""
+        """Waits for messages, returns the first in line; a "work" request replaces one just ahead of it."""
         while True:
             patience = None if not self._waiting else _SETTLE if self._waiting[0][0] == "work" else 0.0
             if not self.connection.poll(patience):

@@ -473,6 +473,6 @@ def bound_ray(field, rays, ray, cells, deepest, most, goal, limits, shifts, room
 
 @njit(cache=True, error_model="numpy", nogil=True, **COUNTED)
 def bound_rays(field, rays, cells, deepest, most, goal, limits, shifts, room, counts, out, pieces):
-    """Call `bound_ray` of r rays: ``cells`` [r, d], ``goal`` [r, 3, 3], ``out`` [r, ., parts, 2, 3], `pieces` [r, 3]."""
+    """Call `bound_ray` for rays: ``cells`` [r, d], ``goal`` [r, 3, 3], ``out`` [r, ., parts, 2, 3], `pieces` [r, 3]."""
     for k in range(cells.shape[0]):
         pieces[k] = bound_ray(field, rays, k, cells[k], deepest, most, goal[k], limits, shifts, room, counts, out[k])
