@@ -280,18 +280,18 @@ def test_the_later_attack_takes_a_part_of_the_time(tmp_path: Path) -> None:
     network = load_network(small(tmp_path))
     search = box_decisions._BoxSearch(network, session(tmp_path / "small.onnx"), Deadline(60.0), 1 << 30, "real")
     tuning = box_decisions.BoxTuning()
-    search.by_input = 1e-6
-    assert search._later(3) == tuning.later_attack
+    search.seconds_by_input = 1e-6
+    assert search._later_attack(3) == tuning.later_attack
     for groups in (1, 4):
-        search.by_input = 2e-3
-        starts, steps = search._later(groups)
+        search.seconds_by_input = 2e-3
+        starts, steps = search._later_attack(groups)
         assert (
             tuning.least_attack[0] <= starts < tuning.later_attack[0]
             and tuning.least_attack[1] <= steps < tuning.later_attack[1]
         )
-        assert groups * starts * steps * search.by_input <= tuning.later_share * 60.0
-    search.by_input = 1e3
-    assert search._later(1) == tuning.least_attack
+        assert groups * starts * steps * search.seconds_by_input <= tuning.later_share * 60.0
+    search.seconds_by_input = 1e3
+    assert search._later_attack(1) == tuning.least_attack
 
 
 def test_deadlines_are_asked_often(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -10,12 +10,12 @@ _ROOM = "test_phase_tree.py::test_branches_without_room_are_not_lost[0]"
 BOXES = (
     Fault(
         "boxes: one half of a box that an input dominates is proved",
-        _BOXES, "_BoxSearch._assume", "[(*half, left) for half in halves]", "[(*half, left) for half in halves[:1]]",
+        _BOXES, "_BoxSearch._branch", "[(*half, left) for half in halves]", "[(*half, left) for half in halves[:1]]",
         _DOMINATED,
     ),
     Fault(
         "boxes: halves are asked for one group of those that are left",
-        _BOXES, "_BoxSearch._assume", "(*half, left)", "(*half, left[:1])", _DOMINATED,
+        _BOXES, "_BoxSearch._branch", "(*half, left)", "(*half, left[:1])", _DOMINATED,
     ),
     Fault(
         "boxes: halves leave a gap",

@@ -100,7 +100,7 @@ CERTIFICATES = (
     ),
     Fault(
         "parts: one without a proof is passed over",
-        _COVER, "SubBoxProof._left", "not margins[k] > 0.0", "margins[k] == 0.0",
+        _COVER, "SubBoxProof._unproved", "not margins[k] > 0.0", "margins[k] == 0.0",
         "test_cover.py::test_one_part_without_a_proof_leaves_the_cell_without",
     ),
     Fault(
@@ -255,15 +255,15 @@ CERTIFICATES = (
     ),
     Fault(
         "unsafe sets: at least is read as at most",
-        _VNNLIB, "_ways", "(left, right) if head == '<=' else (right, left)", "(left, right)", _UNSAFE,
+        _VNNLIB, "_disjunction", "(left, right) if head == '<=' else (right, left)", "(left, right)", _UNSAFE,
     ),
     Fault(
         "unsafe sets: differences are sums",
-        _VNNLIB, "_ways", "_sum(low, high, -1.0)", "_sum(low, high, 1.0)", _UNSAFE,
+        _VNNLIB, "_disjunction", "_sum(low, high, -1.0)", "_sum(low, high, 1.0)", _UNSAFE,
     ),
     Fault(
         "unsafe sets: of joined assertions the last counts",
-        _VNNLIB, "_ways", "way += more[0]", "way[:] = more[0]",
+        _VNNLIB, "_disjunction", "way += more[0]", "way[:] = more[0]",
         _UNSAFE,
     ),
     Fault(
@@ -352,7 +352,8 @@ CERTIFICATES = (
     ),
     Fault(
         "boxes: the later attack takes its part of the time for every group",
-        "verify/box_decisions.py", "_BoxSearch._later", "self.by_input * groups", "self.by_input",
+        "verify/box_decisions.py", "_BoxSearch._later_attack", "self.seconds_by_input * groups",
+        "self.seconds_by_input",
         "test_phase_tree.py::test_the_later_attack_takes_a_part_of_the_time",
     ),
     Fault(
@@ -445,13 +446,14 @@ CERTIFICATES = (
         "test_certify_search.py::test_cells_of_cheap_models_fail_as_a_whole_only_after_a_second_look",
     ),
     Fault(
-        "search: the whole set fails by nine poses", "verify/search.py", "Search._last",
+        "search: the whole set fails by nine poses", "verify/search.py", "Search._samples_that_may_hold",
         "_WITNESSES * cell.cell.volume / self.grid.volume", "0.0",
         "test_certify_search.py::test_a_wide_cell_fails_as_a_whole_only_after_many_looks[False]",
     ),
     Fault(
         "search: cells are given up where one scene breaks one pose",
-        _SAMPLES, "CellSamples.hopeless", "len(self._where(_spoilt)) == len(self.poses)", "bool(self._where(_spoilt))",
+        _SAMPLES, "CellSamples.hopeless", "len(self._where(_not_positive)) == len(self.poses)",
+        "bool(self._where(_not_positive))",
         _SCENES,
     ),
     Fault(

@@ -299,7 +299,7 @@ FORMS = (
     Fault(
         "the mean gap that is reported is that of earlier bounds",
         _LEAVES,
-        "LeafBounds._bound",
+        "LeafBounds._tighten",
         "self._mean_gap = None",
         "pass",
         "test_engine.py::test_gaps_that_are_reported_are_those_of_the_bounds_at_that_time[1]",

@@ -261,7 +261,7 @@ LOCATION = (
     ),
     Fault(
         "location: a cell is possible by a pose beside it",
-        _SEARCH, "_Examination._glance", "picture, self.nearby = nearby", "picture, self.best = nearby",
+        _SEARCH, "_Examination._approximate_tiles", "picture, self.nearby = nearby", "picture, self.best = nearby",
         "test_locate.py::test_a_pose_beside_a_cell_does_not_make_it_possible", compiled=True,
     ),
     Fault(

@@ -70,11 +70,11 @@ PICTURES = (
         "low - taken[0]", _INSIDE,
     ),
     Fault(
-        "measures: one rank too high", _MEASURES, "Measure._one", "len(pixels) - self.rank",
+        "measures: one rank too high", _MEASURES, "Measure._statistic_bounds", "len(pixels) - self.rank",
         "min(len(pixels) - 1, len(pixels) - self.rank + 1)", _INSIDE,
     ),
     Fault(
-        "measures: means of the upper planes from below", _MEASURES, "Measure._mean",
+        "measures: means of the upper planes from below", _MEASURES, "Measure._mean_bounds",
         "0 if sign * weight > 0.0 else 2", "2 if sign * weight > 0.0 else 0", _INSIDE,
     ),
     Fault(
@@ -164,7 +164,7 @@ PICTURES = (
         "test_part_proofs.py::test_sets_of_a_part_that_cross_decide_nothing",
     ),
     Fault(
-        "proved parts: units of a fixed partition are refuted together", "verify/search.py", "Search._decided",
+        "proved parts: units of a fixed partition are refuted together", "verify/search.py", "Search._decided_parts",
         "not self.every_unit", "True",
         "test_part_proofs.py::test_refuted_parts_are_falsified_at_once",
     ),
@@ -184,7 +184,7 @@ PICTURES = (
     ),
     Fault(
         "proved parts: bounds over sub-boxes are those of the other end", _MEASURES, "PlaneSets.over",
-        "side[:, found, cut]", "side[::-1, found, cut]",
+        "side[:, read, cut]", "side[::-1, found, cut]",
         "test_part_proofs.py::test_ends_over_sub_boxes_are_those_of_their_pixels",
     ),
     Fault(

@@ -95,7 +95,7 @@ class Refinement:
         #: cells are told apart by their numbers
         self._numbers = itertools.count(1 + max((cell.number for cell, _, _ in initial or ()), default=-1))
         #: middles of initial cells that are not rendered unless the goal asks for them
-        self._unseen: list[np.ndarray] = []
+        self._unrendered: list[np.ndarray] = []
 
     # --- measures ------------------------------------------------------------------------------
 
@@ -225,7 +225,7 @@ class Refinement:
             if number % 2:
                 self.inner.render(part.box.middle)
             elif len(parts) > 1:
-                self._unseen.append(part.box.middle)
+                self._unrendered.append(part.box.middle)
             if number + 1 < len(parts):
                 share, points = (number + 1) / len(parts), self.tuning.initial_points
                 due = int(share * points) > int(number / len(parts) * points)
@@ -305,9 +305,9 @@ class Refinement:
         point = self._record(1.0)
         if self._over() or self.goal.met(point):
             return False
-        if self._unseen:
+        if self._unrendered:
             # first what may show that the goal is met already: half of them, then half of the rest
-            middles, self._unseen = self._unseen[::2], self._unseen[1::2]
+            middles, self._unrendered = self._unrendered[::2], self._unrendered[1::2]
             for values in middles:
                 if not self._over():
                     self.inner.render(values)

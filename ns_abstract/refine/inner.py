@@ -156,7 +156,7 @@ class InnerBound:
 
 
 def sampled_gap(frame: Frame, index: int, seed: int, tuning: Tuning = TUNING) -> float:
-    """Return the MPG of renders at the middle and at two opposite ends of the set: at most the inner bound's."""
+    """Return the MPG of renders at the middle and at two corners of the set: at most the inner bound's."""
     corners = _some_corners(frame.box, np.random.default_rng([seed, index]), tuning.most_corners)
     pictures = [frame.render(values) for values in (frame.box.middle, *corners[[0, -1]])]
     least, most = np.minimum.reduce(pictures), np.maximum.reduce(pictures)

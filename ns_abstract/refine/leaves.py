@@ -131,15 +131,15 @@ class LeafBounds:
         for _, lower, upper in self._taken[1:]:
             np.minimum(self.lower, lower, out=self.lower)
             np.maximum(self.upper, upper, out=self.upper)
-        self._bound(self.tiles.all)
+        self._tighten(self.tiles.all)
 
     def update(self, places: np.ndarray, changes: dict[int, Change] | None = None) -> None:
         """Update the outer bound of the tiles at ``places``, given the changes since the round began."""
         for t in places:
             self.lower[t], self.upper[t] = self.by_tile[t].outer(None if changes is None else changes[t])
-        self._bound(places)
+        self._tighten(places)
 
-    def _bound(self, places: np.ndarray) -> None:
+    def _tighten(self, places: np.ndarray) -> None:
         """Make the outer bound of tiles usable, and intersect it with the earlier one."""
         self._intersect(places)
         self.lower[places], self.upper[places] = usable(self.lower[places], self.upper[places])
@@ -183,7 +183,7 @@ class LeafBounds:
         """Return [t, side, side] the pixels for which leaves in the tiles and rows ``rows`` are split; None: all."""
         if not self.tiles.by_pixel:
             return None
-        return np.stack([self._open(t, *(side[None] for side in self.row(t, row)))[0] > 0.0 for t, row in rows.items()])
+        return np.stack([self._excess(t, *(side[None] for side in self.row(t, k)))[0] > 0.0 for t, k in rows.items()])
 
     def close_excess(self, allowed: float) -> None:
         """Close pixels of leaves that could reduce the excess by little, compared with the ``allowed`` one."""
@@ -195,7 +195,7 @@ class LeafBounds:
         if self._taken:
             self._divide()
         while True:
-            amounts, owner = self._excess()
+            amounts, owner = self._open_excess()
             if not owner:
                 return [], 2
             order = np.argsort(-amounts, kind="stable")
@@ -219,7 +219,7 @@ class LeafBounds:
         allowed = (goal.ratio - 1.0) * float(moved[self.tiles.inside].sum())
         return jobs, MOST_PARTS if running[-1] > self.tuning.wide_split_excess * allowed else 2
 
-    def _excess(self) -> tuple[np.ndarray, list[tuple[int, int]]]:
+    def _open_excess(self) -> tuple[np.ndarray, list[tuple[int, int]]]:
         """Return every open leaf's excess over the inner bound, and its tile and row.
 
         Leaves that cannot be improved are closed; the memory of the others is counted.
@@ -231,7 +231,7 @@ class LeafBounds:
         for t, tile in enumerate(self.by_tile):
             if tile.lower is None or tile.upper is None:
                 continue
-            amount = self._open(t, tile.lower, tile.upper).sum(axis=(1, 2), dtype=np.float64)
+            amount = self._excess(t, tile.lower, tile.upper).sum(axis=(1, 2), dtype=np.float64)
             done = (amount <= 0.0) | np.array([cell.narrow for cell in tile.cells])
             tile.close(done)
             amount = amount[~done]
@@ -244,7 +244,7 @@ class LeafBounds:
         self.bytes += sum(context_bytes(context) for context in contexts.values())
         return np.concatenate(excess), owner
 
-    def _open(self, t: int, lower: np.ndarray, upper: np.ndarray) -> np.ndarray:
+    def _excess(self, t: int, lower: np.ndarray, upper: np.ndarray) -> np.ndarray:
         """Return the excess [n, side, side] of leaves of tile t over the inner bound, zero where it is too small."""
         colors = np.s_[..., :COLORS]
         lower, upper = lower[colors], upper[colors]

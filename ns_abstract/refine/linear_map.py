@@ -68,26 +68,26 @@ class _Part:
     box_shift: Float64Array
 
 
-def _place(low: Float64Array, high: Float64Array, start: Float64Array, end: Float64Array) -> tuple[Float64Array, ...]:
+def _affine(low: Float64Array, high: Float64Array, start: Float64Array, end: Float64Array) -> tuple[Float64Array, ...]:
     """Return scale and shift of [start, end] within [low, high] as [-1, 1]: six roundings of numbers up to 1 (R7)."""
     width = end - start
     divisor = np.where(width > 0.0, width, 1.0)
     return (high - low) / divisor, ((low - start) + (high - end)) / divisor
 
 
-def _parts(leaves: Leaves, rows: np.ndarray, box: ParameterBox) -> tuple[np.ndarray, _Part]:
+def _common_parts(leaves: Leaves, rows: np.ndarray, box: ParameterBox) -> tuple[np.ndarray, _Part]:
     """Return those of ``rows`` that meet the box, and the intersections: arrays [n, d]."""
     start, end = leaves.box_lower[rows], leaves.box_upper[rows]
     box_start, box_end = np.array(box.lower, np.float64), np.array(box.upper, np.float64)
     low, high = np.maximum(start, box_start), np.minimum(end, box_end)
     meets = (low <= high).all(axis=1)
     low, high, start, end = low[meets], high[meets], start[meets], end[meets]
-    scale, shift = _place(low, high, start, end)
-    box_scale, box_shift = _place(low, high, box_start, box_end)
+    scale, shift = _affine(low, high, start, end)
+    box_scale, box_shift = _affine(low, high, box_start, box_end)
     return rows[meets], _Part(scale, shift, box_scale, box_shift)
 
 
-def _complete(part: _Part, box: ParameterBox) -> bool:
+def _covers_box(part: _Part, box: ParameterBox) -> bool:
     """Return whether the leaves cover the box."""
     varied = np.array(box.lower) < np.array(box.upper)
     return bool(part.box_scale[:, varied].prod(axis=1).sum() >= COVER_DOWN)
@@ -97,7 +97,7 @@ def _chunks(count: int) -> Iterator[slice]:
     return (slice(k, k + _CHUNK) for k in range(0, count, _CHUNK))
 
 
-def _slope(A: np.ndarray, b: np.ndarray, rows: np.ndarray, part: _Part, varied: np.ndarray) -> np.ndarray:
+def _fitted_slope(A: np.ndarray, b: np.ndarray, rows: np.ndarray, part: _Part, varied: np.ndarray) -> np.ndarray:
     """Return slopes [side, side, 3, d] of the least-squares plane through leaves' planes; any slopes are sound."""
     total = np.zeros(A.shape[1:], np.float64)
     shares = part.box_scale[:, varied].prod(axis=1)
@@ -110,7 +110,9 @@ def _slope(A: np.ndarray, b: np.ndarray, rows: np.ndarray, part: _Part, varied: 
     return np.where(varied, total, 0.0).astype(np.float32)
 
 
-def _least(A: np.ndarray, b: np.ndarray, rows: np.ndarray, part: _Part, slope: np.ndarray, sign: float) -> np.ndarray:
+def _offset_below(
+    A: np.ndarray, b: np.ndarray, rows: np.ndarray, part: _Part, slope: np.ndarray, sign: float
+) -> np.ndarray:
     """Return offsets [side, side, 3] with which ``slope`` stays below every leaf's plane, times ``sign`` (R7)."""
     least = np.full(b.shape[1:], np.inf)
     plane = sign * slope.astype(np.float64)
@@ -145,15 +147,15 @@ def linear_image(leaves: Leaves, lower: Float32Array, upper: Float32Array, box: 
     slopes = [np.zeros((*lower.shape, box.dimensions), np.float32) for _ in range(2)]
     offsets = [lower.copy(), upper.copy()]
     for row, column, tile_rows in _by_tile(leaves):
-        rows, part = _parts(leaves, tile_rows, box)
-        if not _complete(part, box):
+        rows, part = _common_parts(leaves, tile_rows, box)
+        if not _covers_box(part, box):
             continue
         for k, (A, b, sign) in enumerate(
             ((leaves.A_lower, leaves.b_lower, 1.0), (leaves.A_upper, leaves.b_upper, -1.0))
         ):
-            plane = _slope(A, b, rows, part, varied)
+            plane = _fitted_slope(A, b, rows, part, varied)
             for slope in (plane, np.zeros_like(plane)):
-                least = _least(A, b, rows, part, slope, sign)
+                least = _offset_below(A, b, rows, part, slope, sign)
                 offset = sign * outward(least, least)[0]
                 pixels = slopes[k][row : row + b.shape[1], column : column + b.shape[2]]
                 height, width = pixels.shape[:2]
@@ -174,7 +176,7 @@ def bounds_at(
         return low, high
     holds = ((leaves.box_lower <= point) & (point <= leaves.box_upper)).all(axis=1)
     for n in np.flatnonzero(holds):
-        _, place = _place(point, point, leaves.box_lower[n], leaves.box_upper[n])
+        _, place = _affine(point, point, leaves.box_lower[n], leaves.box_upper[n])
         row, column = leaves.tile[n]
         for A, b, sign, bound in (
             (leaves.A_lower, leaves.b_lower, 1.0, low),

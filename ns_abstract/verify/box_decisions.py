@@ -102,7 +102,7 @@ def decide(
         with deadline.enforced():
             for shared in _by_property(regions):
                 if search.decide(shared):
-                    return Decision("sat", *search.found, search.boxes)
+                    return Decision("sat", *search.counterexample, search.boxes)
     except WorkCancelledError:
         return Decision("timeout", boxes=search.boxes)
     return Decision("unknown" if search.undecided else "unsat", boxes=search.boxes)
@@ -163,21 +163,21 @@ class _BoxSearch:
         self.arithmetic: NetworkArithmetic = arithmetic
         self.boxes = 0
         total = sum(int(np.prod(network.shape(k))) for k in range(len(network.nodes) + 1))
-        self.together = min(_MOST, max(8, _TOGETHER // total))
-        self.attacked = min(_TUNING.most_attacked, max(4, _ATTACKED // total))
+        self.batch = min(_MOST, max(8, _TOGETHER // total))
+        self.attack_batch = min(_TUNING.most_attacked, max(4, _ATTACKED // total))
         self.undecided = False
         # seconds of an input in the first attack, and of the latest bounds of all nodes
-        self.by_input, self.by_bounds = _TUNING.least_seconds, 0.0
-        self.descended = 0
-        self.found: tuple[np.ndarray, np.ndarray] = (np.zeros(0), np.zeros(0))
+        self.seconds_by_input, self.seconds_by_bounds = _TUNING.least_seconds, 0.0
+        self.evaluated_inputs = 0
+        self.counterexample: tuple[np.ndarray, np.ndarray] = (np.zeros(0), np.zeros(0))
 
     def decide(self, shared: _SharedProperty) -> bool:
-        """Return whether a region has a counterexample, stored in `found`; sets `undecided` if that stays open."""
-        start, self.descended = self.deadline.left, 0
+        """Return whether a region has a counterexample, which is stored; sets `undecided` if that stays open."""
+        start, self.evaluated_inputs = self.deadline.left, 0
         descent = self.deadline.within(_TUNING.first_share * start)
         if self._attack(shared, np.arange(len(shared.regions)), *_TUNING.first_attack, descent=descent):
             return True
-        self.by_input = max(_TUNING.least_seconds, (start - self.deadline.left) / max(1, self.descended))
+        self.seconds_by_input = max(_TUNING.least_seconds, (start - self.deadline.left) / max(1, self.evaluated_inputs))
         if not all(shared.unsafe.groups):
             # any output is unsafe, and no input could be shown to have one
             self.undecided = True
@@ -187,7 +187,7 @@ class _BoxSearch:
             self.bounded = centred(self.network, middle.reshape(1, *self.network.input_shape))
         if int((shared.upper > shared.lower).sum(1).max()) <= _TUNING.most_to_cut:
             return self._bisect(shared)
-        return any(self._assume(shared, which) for which in range(len(shared.regions)))
+        return any(self._branch(shared, which) for which in range(len(shared.regions)))
 
     # ------------------------------------------------------------ proofs
 
@@ -197,7 +197,7 @@ class _BoxSearch:
         most = _WAITING + len(waiting)
         while waiting:
             check_cancelled()
-            boxes, waiting = waiting[-self.together :], waiting[: -self.together]
+            boxes, waiting = waiting[-self.batch :], waiting[: -self.batch]
             bounds = self._bound(shared, boxes)
             proved = proves(bounds, shared.unsafe.groups)
             self.boxes += len(boxes)
@@ -212,20 +212,20 @@ class _BoxSearch:
                 waiting += [(boxes[k][0], *half) for half in halves]
         return False
 
-    def _assume(self, shared: _SharedProperty, which: int) -> bool:
+    def _branch(self, shared: _SharedProperty, which: int) -> bool:
         """Do `decide` for one region by cutting dominant inputs, then branching on activation phases (N16)."""
         waiting = [(shared.lower[which], shared.upper[which], shared.unsafe.groups)]
         attacked = False
         while waiting:
             check_cancelled()
             lower, upper, groups = waiting.pop()
-            images = self._images(lower[None], upper[None])
-            tree, left = self._tree(shared, which, images, 0, groups)
+            images = self._input_sets(lower[None], upper[None])
+            tree, left = self._phase_tree(shared, which, images, 0, groups)
             if left and not attacked:
-                if self._attack(shared, np.array([which]), *self._later(len(left)), left):
+                if self._attack(shared, np.array([which]), *self._later_attack(len(left)), left):
                     return True
                 attacked = True
-            halves = self._dominated(lower, upper) if left else None
+            halves = self._dominant_halves(lower, upper) if left else None
             if halves is not None:
                 # what is proved of the whole holds in both
                 waiting += [(*half, left) for half in halves]
@@ -247,7 +247,7 @@ class _BoxSearch:
 
         ``boxes``: the number of boxes that share the remaining time.
         """
-        by_step = max(_TUNING.least_seconds, _TUNING.step_cost * self.by_bounds)
+        by_step = max(_TUNING.least_seconds, _TUNING.step_cost * self.seconds_by_bounds)
         allowed = _TUNING.lines_share * self.deadline.left / boxes
         steps = int(min(1e6, allowed / by_step)) - _TUNING.steps_before
         if farther_steps(steps):
@@ -257,7 +257,7 @@ class _BoxSearch:
         if left and steps > 0:
             try:
                 with self.deadline.within(allowed).enforced():
-                    tree, left = self._tree(shared, which, images, steps, left)
+                    tree, left = self._phase_tree(shared, which, images, steps, left)
             except WorkCancelledError:
                 # what is known without goes on
                 check_cancelled()
@@ -268,7 +268,7 @@ class _BoxSearch:
                 return False
         return True
 
-    def _dominated(self, lower: np.ndarray, upper: np.ndarray) -> list[tuple[np.ndarray, np.ndarray]] | None:
+    def _dominant_halves(self, lower: np.ndarray, upper: np.ndarray) -> list[tuple[np.ndarray, np.ndarray]] | None:
         """Return two halves of a box [n], cut across the input that moves the neurons most; None if none dominates."""
         if not 0 < int((upper > lower).sum()) <= _TUNING.most_to_rank:
             return None
@@ -276,7 +276,7 @@ class _BoxSearch:
         at = int(parts.argmax())
         return _halves(lower, upper, at) if parts[at] > _TUNING.dominant_share else None
 
-    def _tree(
+    def _phase_tree(
         self, shared: _SharedProperty, which: int, images: ImageSets, steps: int, groups: Sequence[tuple[int, ...]]
     ) -> tuple[PhaseTree, list[tuple[int, ...]]]:
         """Return a tree over bounds with ``steps`` for intermediate ones, and the groups that its root leaves open."""
@@ -285,7 +285,7 @@ class _BoxSearch:
             self.bounded, images, self.memory, self.arithmetic, 1, intermediate_steps=steps,
             asked=shared.unsafe.rows, coarse=True,
         )  # fmt: skip
-        self.by_bounds = start - self.deadline.left
+        self.seconds_by_bounds = start - self.deadline.left
         tree, left = PhaseTree(cells, shared.unsafe.rows, shared.offset[which]), []
         for group in groups:
             result = tree.prove(group, 1)
@@ -294,7 +294,7 @@ class _BoxSearch:
                 left.append(group)
         return tree, left
 
-    def _images(self, lower: np.ndarray, upper: np.ndarray) -> ImageSets:
+    def _input_sets(self, lower: np.ndarray, upper: np.ndarray) -> ImageSets:
         """Return boxes [m, n] as image sets; inputs that vary are the parameters, in order, if they are few."""
         varies = upper > lower
         # the program rounds an input to float32, and rounding keeps the order
@@ -317,7 +317,7 @@ class _BoxSearch:
         which, lower, upper = (np.stack(ends) for ends in zip(*boxes, strict=True))
         bounds = bound_outputs(
             self.bounded,
-            self._images(lower, upper),
+            self._input_sets(lower, upper),
             shared.unsafe.rows,
             shared.offset[which],
             memory=self.memory,
@@ -351,10 +351,10 @@ class _BoxSearch:
         Of several ``groups`` each is attacked alone. Starts after ``descent`` are evaluated only.
         """
         # a few steps where there are many regions: most are tiny
-        steps = min(steps, max(3, 4 * self.attacked // len(regions)))
-        starts = max(2, min(starts, self.attacked, _TUNING.most_attacked // len(regions)))
+        steps = min(steps, max(3, 4 * self.attack_batch // len(regions)))
+        starts = max(2, min(starts, self.attack_batch, _TUNING.most_attacked // len(regions)))
         generator = torch.Generator().manual_seed(0)
-        step = max(1, self.attacked // starts)
+        step = max(1, self.attack_batch // starts)
         for first in range(0, len(regions), step):
             which = regions[first : first + step]
             ends = shared.lower[which], shared.upper[which]
@@ -369,10 +369,10 @@ class _BoxSearch:
                     return True
         return False
 
-    def _later(self, groups: int) -> tuple[int, int]:
+    def _later_attack(self, groups: int) -> tuple[int, int]:
         """Return starts and steps of the second attack: fewer where all would take too much of the remaining time."""
         starts, steps = _TUNING.later_attack
-        allowed = _TUNING.later_share * self.deadline.left / (self.by_input * groups)
+        allowed = _TUNING.later_share * self.deadline.left / (self.seconds_by_input * groups)
         part = min(1.0, max(0.0, allowed) / (starts * steps)) ** 0.5
         return max(_TUNING.least_attack[0], int(part * starts)), max(_TUNING.least_attack[1], int(part * steps))
 
@@ -390,10 +390,10 @@ class _BoxSearch:
         size = 0.25
         for left in reversed(range(steps)):
             check_cancelled()
-            self.descended += len(x)
+            self.evaluated_inputs += len(x)
             x = x.detach().requires_grad_(left > 0)
             value = self._value(shared, x, which, group)
-            if self._any(shared, x.detach(), which, value.detach()):
+            if self._confirm(shared, x.detach(), which, value.detach()):
                 return True
             if not value.requires_grad:
                 break
@@ -411,9 +411,9 @@ class _BoxSearch:
             which += [region] * (1 + len(slopes))
         with torch.no_grad():
             tried, regions = torch.from_numpy(np.stack(x)), np.array(which)
-            return self._any(shared, tried, regions, self._value(shared, tried, regions))
+            return self._confirm(shared, tried, regions, self._value(shared, tried, regions))
 
-    def _any(self, shared: _SharedProperty, x: torch.Tensor, which: np.ndarray, value: torch.Tensor) -> bool:
+    def _confirm(self, shared: _SharedProperty, x: torch.Tensor, which: np.ndarray, value: torch.Tensor) -> bool:
         """Return whether one of the inputs with unsafe values is unsafe in the runtime, too."""
         order = torch.argsort(value)[:2].tolist()
         for k in order:
@@ -423,7 +423,7 @@ class _BoxSearch:
             point = np.clip(x[k].numpy(), region.lower, region.upper)
             y = run_once(self.network, self.run, point)
             if bool(np.isfinite(y).all()) and region.holds(y):
-                self.found = point, y
+                self.counterexample = point, y
                 return True
         return False
 

@@ -73,12 +73,12 @@ class CellSamples:
     @property
     def undecided(self) -> int:
         """The number of poses with a margin that is not finite."""
-        return len(self._where(_unknown))
+        return len(self._where(_not_finite))
 
     @property
     def hopeless(self) -> bool:
         """Whether the property holds for all scenes at no sampled pose."""
-        return len(self._where(_spoilt)) == len(self.poses)
+        return len(self._where(_not_positive)) == len(self.poses)
 
     @property
     def proved(self) -> bool:
@@ -94,7 +94,7 @@ class CellSamples:
     @property
     def holds(self) -> bool:
         """Whether the property holds for all sampled scenes at the first pose, the middle."""
-        return self.samples[0][0].tobytes() not in self._where(_spoilt)
+        return self.samples[0][0].tobytes() not in self._where(_not_positive)
 
     def fresh_poses(self, generator: np.random.Generator, corners: int, random: int) -> list[np.ndarray]:
         """Return at most ``corners`` corners and ``random`` random poses that have not been sampled."""
@@ -143,11 +143,11 @@ def _fails(margin: float) -> bool:
     return math.isfinite(margin) and margin <= 0.0
 
 
-def _unknown(margin: float) -> bool:
+def _not_finite(margin: float) -> bool:
     return not math.isfinite(margin)
 
 
-def _spoilt(margin: float) -> bool:
+def _not_positive(margin: float) -> bool:
     return not 0.0 < margin < math.inf
 
 

@@ -117,7 +117,7 @@ class LocationSearch:
         return self.photo.tiled(self.frame.side)
 
     @cached_property
-    def _pace(self) -> Float64Array:
+    def _motion_per_unit(self) -> Float64Array:
         """Image motion [d] in pixels of typical scene elements by unit of each parameter."""
         box = self.frame.box
         motion = np.nan_to_num(np.asarray(self.frame.motion(box), np.float64), nan=0.0, posinf=0.0)
@@ -126,14 +126,14 @@ class LocationSearch:
         return motion / (np.array(box.upper) - np.array(box.lower))
 
     @cached_property
-    def _width_pace(self) -> Float64Array:
+    def _width_per_unit(self) -> Float64Array:
         """The same [d] for the motion that widens bounds; see `widths`. It may take seconds for large pictures."""
         box = self.frame.box
         if not self.by_motion:
-            return self._pace / self.along(box)
+            return self._motion_per_unit / self.along(box)
         assert isinstance(self.frame, SubBoxFrame)
         parallax = self.frame.parallax(box) / (np.array(box.upper) - np.array(box.lower))
-        return parallax + self.tuning.motion_share * self._pace
+        return parallax + self.tuning.motion_share * self._motion_per_unit
 
     @property
     def sub_box_frame(self) -> SubBoxFrame | None:
@@ -165,11 +165,11 @@ class LocationSearch:
 
     def moved(self, box: ParameterBox) -> Float64Array:
         """Return the estimated image motion [d] in pixels of typical scene elements over a cell."""
-        return self._pace * (np.array(box.upper) - np.array(box.lower))
+        return self._motion_per_unit * (np.array(box.upper) - np.array(box.lower))
 
     def widths(self, box: ParameterBox) -> Float64Array:
         """Return the estimated pixels [d] by which parameters widen bounds: motion that sub-boxes do not follow."""
-        return self._width_pace * (np.array(box.upper) - np.array(box.lower))
+        return self._width_per_unit * (np.array(box.upper) - np.array(box.lower))
 
     def width(self, box: ParameterBox) -> float:
         """Return the norm of the `widths`."""
@@ -224,7 +224,7 @@ class LocationSearch:
         reports = [_Examination(self, cell, self.tiled.chosen(cell.outliers)) for cell in cells]
         for report in reports:
             report.run()
-        children = [report.heir(part) for report in reports for part in report.children]
+        children = [report.with_known_outliers(part) for report in reports for part in report.children]
         poses = [pose for report in reports for pose in (report.best, report.nearby) if pose is not None]
         return LocationResult(
             leaves=tuple(leaf for report in reports for leaf in report.leaves),
@@ -284,13 +284,13 @@ class _Examination:
                 break
             moved = float(np.linalg.norm(search.moved(box))) if search.by_motion else search.width(box)
             if moved > tuning.contracted:
-                some = self._sub_boxes(box)
-                if some:
+                excluded = self._exclude_sub_boxes(box)
+                if excluded:
                     return None
-                if some is False:
+                if excluded is False:
                     break
-            picture, number = self._look(box.middle)
-            if not self._whole(box, picture, number) or self.cell.volume > (1.0 - tuning.worth) * before:
+            picture, outliers = self._look(box.middle)
+            if not self._bound_whole(box, picture, outliers) or self.cell.volume > (1.0 - tuning.worth) * before:
                 break
         if not self.done:
             self.cut()
@@ -301,7 +301,7 @@ class _Examination:
         """Whether every remaining part of the cell has a verdict."""
         return bool(self.leaves) and self.leaves[-1].cell == self.cell
 
-    def _sub_boxes(self, box: ParameterBox) -> bool | None:
+    def _exclude_sub_boxes(self, box: ParameterBox) -> bool | None:
         """Exclude sub-boxes of the cell; return whether any was, or None if the frame cannot bound sub-boxes."""
         search, tuning = self.search, self.search.tuning
         frame, cells = search.sub_box_frame, search.motion_cells(box)
@@ -309,7 +309,7 @@ class _Examination:
         if frame is None or cells is None or not resolved(box, counts):
             return None
         boxes, parts = MotionBoxes(cells, counts, search.frame.camera), cells if search.by_motion else counts
-        rounds, order = self._rounds(box, self._glance(box), counts)
+        rounds, order = self._rounds(box, self._approximate_tiles(box), counts)
         while (chosen := rounds.following(*order.towards(boxes.moved[rounds.left]))) is not None:
             self.bounded += 1
             tiles, (telling, differences) = np.flatnonzero(chosen.any(axis=(1, 2))), order.telling(chosen)
@@ -325,8 +325,8 @@ class _Examination:
         if left.all():
             return False
         remaining: list[Cell] = []
-        for cell, some in divided(self.cell, left, tuning.filled):
-            if some:
+        for cell, has_left in divided(self.cell, left, tuning.filled):
+            if has_left:
                 remaining.append(cell)
             else:
                 self.leaves.append(FinishedCell(cell, "certified", 1.0, 0.0))
@@ -337,7 +337,7 @@ class _Examination:
             self.children = remaining
         return True
 
-    def heir(self, part: Cell) -> Cell:
+    def with_known_outliers(self, part: Cell) -> Cell:
         """Return a part of the cell, with the pixels that are known to be outliers at all of its poses (U9)."""
         pixels = self.inherited
         if self.divisions is not None:
@@ -363,7 +363,7 @@ class _Examination:
             self.best = pose
         return picture, pose.outliers
 
-    def _glance(self, box: ParameterBox) -> np.ndarray:
+    def _approximate_tiles(self, box: ParameterBox) -> np.ndarray:
         """Return approximate tiles of the picture at the middle of a cell."""
         moved = self.search.moved_pictures
         nearby = None if moved is None else moved.near(box)
@@ -377,7 +377,7 @@ class _Examination:
         """Whether a rendered pose explains the photo."""
         return self.best is not None and self.best.outliers <= self.search.tiled.allowed
 
-    def _whole(self, box: ParameterBox, picture: np.ndarray, number: int) -> bool:
+    def _bound_whole(self, box: ParameterBox, picture: np.ndarray, outliers: int) -> bool:
         """Bound the cell without sub-boxes, in rounds of pixels, and exclude or contract it (U8).
 
         Returns:
@@ -386,7 +386,7 @@ class _Examination:
         search, tiled, tuning = self.search, self.search.tiled, self.search.tuning
         before = self.cell.volume
         linear = search.contract and float(np.linalg.norm(search.moved(box))) <= tuning.contracted
-        (rounds, telling), known = self._rounds(box, picture, np.ones(box.dimensions, np.int64)), None
+        (rounds, telling), linear_bounds = self._rounds(box, picture, np.ones(box.dimensions, np.int64)), None
         order = telling.everywhere
         if order[0].size < tuning.promise * (tiled.allowed + 1 - int(self.inherited.sum())):
             order = order[0][:0], order[1][:0]
@@ -408,17 +408,17 @@ class _Examination:
                 return False
             if not linear:
                 continue
-            known = known or BoundedPixels(tiled, box.dimensions)
-            known.outliers = self.inherited
-            known.add(bounds, tiles, chosen)
+            linear_bounds = linear_bounds or BoundedPixels(tiled, box.dimensions)
+            linear_bounds.outliers = self.inherited
+            linear_bounds.add(bounds, tiles, chosen)
             if last:
-                if self._settled(known):
+                if self._finish_explained(linear_bounds):
                     return False
-                if tiled.allowed < number < tuning.hopeful * search.photo.counted.sum():
-                    fit = known.best_fit(tuning.steps)
+                if tiled.allowed < outliers < tuning.hopeful * search.photo.counted.sum():
+                    fit = linear_bounds.best_fit(tuning.steps)
                     if fit is not None:
                         self._look(box.at(fit))
-            if not self._contracted(box, known):
+            if not self._contract(box, linear_bounds):
                 return False
             if last or self.cell.volume <= (1.0 - tuning.worth) * before:
                 return True
@@ -443,17 +443,17 @@ class _Examination:
         within = frame.enclosing(box) if isinstance(frame, SubBoxFrame) else None
         return frame.bound_parts([box], tiles, within, linear, pixels)[0]
 
-    def _settled(self, known: BoundedPixels) -> bool:
+    def _finish_explained(self, linear_bounds: BoundedPixels) -> bool:
         """Finish the cell and return True if every pose of it explains the photo."""
         tiled = self.search.tiled
-        if int(tiled.counted.sum()) - known.explained > tiled.allowed or not self.explained:
+        if int(tiled.counted.sum()) - linear_bounds.explained > tiled.allowed or not self.explained:
             return False
         self._finish()
         return True
 
-    def _contracted(self, box: ParameterBox, known: BoundedPixels) -> bool:
+    def _contract(self, box: ParameterBox, linear_bounds: BoundedPixels) -> bool:
         """Exclude the part of the cell that the pixels' linear bounds rule out; return whether anything remains."""
-        least, most = known.reach
+        least, most = linear_bounds.reach
         if (least > most).any():
             self._exclude(1.0)
             return False

@@ -106,17 +106,17 @@ class Measure:
 
     def bounds(self, planes: PlaneSets, first: int, parts: CellParts) -> tuple[np.ndarray, np.ndarray]:
         """Return lower and upper bounds [s] of the value over each part of the cell."""
-        low, high = self._one(planes, first, parts, self.pixels)
+        low, high = self._statistic_bounds(planes, first, parts, self.pixels)
         if self.minus is not None:
-            taken = self._one(planes, first, parts, self.minus)
+            taken = self._statistic_bounds(planes, first, parts, self.minus)
             low, high = low - taken[1], high - taken[0]
             if self.rank is None:
                 # one linear function of the pose: what both regions do together cancels
-                both = self._mean(planes, first, parts, [(self.pixels, 1.0), (self.minus, -1.0)])
+                both = self._mean_bounds(planes, first, parts, [(self.pixels, 1.0), (self.minus, -1.0)])
                 low, high = np.maximum(low, both[0]), np.minimum(high, both[1])
         return low - OWN_MARGIN * (1.0 + np.abs(low)), high + OWN_MARGIN * (1.0 + np.abs(high))
 
-    def _one(
+    def _statistic_bounds(
         self, planes: PlaneSets, first: int, parts: CellParts, pixels: np.ndarray
     ) -> tuple[np.ndarray, np.ndarray]:
         """Return bounds [s] of the statistic of some pixels over each part."""
@@ -125,13 +125,13 @@ class Measure:
             rounding = len(pixels) * OWN_MARGIN * np.maximum(np.abs(low).max(axis=1), np.abs(high).max(axis=1))
             low, high = low.mean(axis=1) - rounding, high.mean(axis=1) + rounding
             if math.isinf(self.cap):
-                mean = self._mean(planes, first, parts, [(pixels, 1.0)])
+                mean = self._mean_bounds(planes, first, parts, [(pixels, 1.0)])
                 low, high = np.maximum(low, mean[0]), np.minimum(high, mean[1])
             return low, high
         place = self.rank - 1 if self.least else len(pixels) - self.rank
         return ranked(low, place), ranked(high, place)
 
-    def _mean(
+    def _mean_bounds(
         self, planes: PlaneSets, first: int, parts: CellParts, regions: list[tuple[np.ndarray, float]]
     ) -> tuple[np.ndarray, np.ndarray]:
         """Return bounds [s] of a signed sum of means by linear bounds alone."""
@@ -255,12 +255,12 @@ class PlaneSets:
             ends.append(whole + sign * OWN_MARGIN * size)
         if self.ends is not None:
             place = np.minimum(np.searchsorted(pixels, self.ends.pixels), len(pixels) - 1)
-            found = pixels[place] == self.ends.pixels
+            read = pixels[place] == self.ends.pixels
             for nearer, side, sign in ((np.maximum, self.ends.lower, -1.0), (np.minimum, self.ends.upper, 1.0)):
-                own = side[:, found, cut] @ channels
+                own = side[:, read, cut] @ channels
                 own += sign * OWN_MARGIN * np.abs(own)
                 of_side = ends[0] if sign < 0.0 else ends[1]
-                of_side[:, place[found]] = nearer(of_side[:, place[found]], own)
+                of_side[:, place[read]] = nearer(of_side[:, place[read]], own)
         return ends[0], ends[1]
 
 

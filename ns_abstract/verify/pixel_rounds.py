@@ -75,21 +75,21 @@ class PixelRounds:
         """
         left, needed = self.left, self.photo.allowed + 1
         fresh = ~self.bounded.reshape(-1)[order]
-        order, foreseen = order[fresh], shares[fresh].cumsum()
+        order, likely_so_far = order[fresh], shares[fresh].cumsum()
         # a cell without sub-boxes is left as a whole
         few = self.tuning.few if left.size > 1 else 0.0
         if not left.any():
             self.expected = 1.0
             return None
         typical = float(np.median(self.numbers[left]))
-        rest = self._rate * float(foreseen[-1]) if foreseen.size else 0.0
-        self.expected = (typical + rest) / needed
+        remaining = self._rate * float(likely_so_far[-1]) if likely_so_far.size else 0.0
+        self.expected = (typical + remaining) / needed
         missing = max(needed - typical, self.tuning.least_missing * needed)
-        if not order.size or left.mean() <= few or rest < self.tuning.hopeless * missing:
+        if not order.size or left.mean() <= few or remaining < self.tuning.hopeless * missing:
             return None
         first = not self._excluding
         wanted = (self.tuning.first if first else self.tuning.spare) * missing
-        past = min(int(np.searchsorted(self._rate * foreseen, wanted)) + 1, order.size)
+        past = min(int(np.searchsorted(self._rate * likely_so_far, wanted)) + 1, order.size)
         self._ordered, self._shares = order[:past], shares[fresh][:past]
         chosen = np.zeros(self.bounded.shape, bool)
         chosen.reshape(-1)[order[:past]] = True

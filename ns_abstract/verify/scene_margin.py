@@ -261,7 +261,7 @@ def largest_radius(
 
 
 def three_digits(radius: float) -> float:
-    """Return the radius rounded down to three digits, so that a report states exactly what was proved."""
+    """Return the radius rounded to three digits, so that a report states exactly what was proved."""
     return float(f"{radius:.3g}")
 
 

@@ -98,7 +98,7 @@ class Search:
         self._latest: dict[tuple[bytes, int], np.ndarray] = {}
         self.varies = next(iter(scene.scene_samples(0)), None) is not None
 
-    def _near(self, box: ParameterBox) -> FrameImages:
+    def _pictures_near(self, box: ParameterBox) -> FrameImages:
         """Return the pictures of a cell."""
         return self.scene.near(box) if isinstance(self.scene, NearImages) else self.scene
 
@@ -109,9 +109,9 @@ class Search:
         drawn_by = [self.scene] * len(samples) if scenes is None else scenes
         images = [drawn(scene, sample) for scene, sample in zip(drawn_by, samples, strict=True)]
         self._latest = {sample_key(sample): image for sample, image in zip(samples, images, strict=True)}
-        return self._judged(samples, images)
+        return self._margins_of(samples, images)
 
-    def _judged(self, samples: Sequence[Sample], images: Sequence[np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
+    def _margins_of(self, samples: Sequence[Sample], images: Sequence[np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
         """Return `margins` of samples with pictures ``images``."""
         outputs = np.asarray(self.model.outputs(np.stack(images)), np.float64)
         with torch.no_grad():
@@ -127,8 +127,8 @@ class Search:
         """
         begin = time.perf_counter()
         boxes = [self.grid.box_of(cell) for cell in block]
-        samples = [CellSamples(cell, box, self._near(box)) for cell, box in zip(block, boxes, strict=True)]
-        self._sample(samples, self._early)
+        samples = [CellSamples(cell, box, self._pictures_near(box)) for cell, box in zip(block, boxes, strict=True)]
+        self._sample(samples, self._first_samples)
         by_parts = isinstance(self.model, PartsModel)
         if by_parts:
             # parts of broken cells may hold
@@ -139,9 +139,9 @@ class Search:
         self._sample([cell for cell in samples if cell.parts], self._attack_parts)
         failing = [cell for cell in open_cells if not (cell.proved or cell.broken)]
         if self.costly:
-            self._sample(failing, self._late)
+            self._sample(failing, self._more_samples)
         # a cell is falsified as a whole where nothing else is seen
-        self._sample([cell for cell in samples if cell.broken and cell.hopeless], self._last)
+        self._sample([cell for cell in samples if cell.broken and cell.hopeless], self._samples_that_may_hold)
         self._descend_worst_cell(failing)
         if self.varies:
             self._vary(failing)
@@ -161,7 +161,7 @@ class Search:
 
     # ---------------------------------------------------------------- concrete poses
 
-    def _early(self, cell: CellSamples) -> list[Sample]:
+    def _first_samples(self, cell: CellSamples) -> list[Sample]:
         """Return the middle, and two opposite corners if they cost less than bounds."""
         return [(cell.box.middle, None), *(self._corners(cell) if self.costly else ())]
 
@@ -192,11 +192,11 @@ class Search:
     def _scene_samples(self, cell: CellSamples) -> Iterator[SceneSample]:
         return self.scene.scene_samples(int(_generator(cell.cell).integers(1 << 31)))
 
-    def _late(self, cell: CellSamples) -> list[Sample]:
+    def _more_samples(self, cell: CellSamples) -> list[Sample]:
         """Return corners and random poses that have not been sampled."""
         return [(pose, None) for pose in cell.fresh_poses(_generator(cell.cell), _LATE, _RANDOM)]
 
-    def _last(self, cell: CellSamples) -> list[Sample]:
+    def _samples_that_may_hold(self, cell: CellSamples) -> list[Sample]:
         """Return poses at which the property may hold after all, more for larger cells."""
         if self.every_unit:
             return []
@@ -234,7 +234,7 @@ class Search:
         for cell in sorted(cells, key=lambda c: c.margins[c.worst]):
             pose = cell.samples[cell.worst][0]
             tried = [*itertools.islice(self._scene_samples(cell), _SCENE_SAMPLES), *scene_samples]
-            margins = self._shown(cell, [(pose, scene_sample) for scene_sample in tried])
+            margins = self._add_samples(cell, [(pose, scene_sample) for scene_sample in tried])
             least = min(range(len(tried)), key=lambda k: margins[k] if math.isfinite(margins[k]) else math.inf)
             best, margin = tried[least], margins[least]
             # colours that are clamped at an end of their range have no slope there
@@ -242,13 +242,13 @@ class Search:
                 if margin <= 0.0:
                     break
                 moved = (start or best).signed_gradient_step(cell.box, pose, self._loss, size)
-                (image,) = self._shown(cell, [moved])
+                (image,) = self._add_samples(cell, [moved])
                 if image < margin:
                     (pose, best), margin = moved, image
             scene_samples = [best]
-            self._shown(cell, [(other, best) for key, other in cell.poses.items() if key != pose.tobytes()])
+            self._add_samples(cell, [(other, best) for key, other in cell.poses.items() if key != pose.tobytes()])
 
-    def _shown(self, cell: CellSamples, samples: list[Sample]) -> list[float]:
+    def _add_samples(self, cell: CellSamples, samples: list[Sample]) -> list[float]:
         """Add samples to a cell and return their margins."""
         self._sample([cell], lambda _: samples)
         return cell.margins[len(cell.margins) - len(samples) :]
@@ -266,11 +266,11 @@ class Search:
         if not self.costly or self.grid.box.dimensions < 2 or not hopeful:
             return
         cell = min(hopeful, key=lambda c: c.margins[c.worst])
-        step = descend(cell.box, cell.samples[cell.worst][0], self._slope, _STEPS, lambda margin: margin <= 0.0)
+        step = descend(cell.box, cell.samples[cell.worst][0], self._margin_at, _STEPS, lambda margin: margin <= 0.0)
         if step is not None:
             self._sample([cell], lambda c: [(step, None)])
 
-    def _slope(self, values: torch.Tensor) -> torch.Tensor:
+    def _margin_at(self, values: torch.Tensor) -> torch.Tensor:
         """Return the margin at parameter values [d], differentiable."""
         outputs = self.model.differentiable(self.scene.differentiable(values)[None])
         return self.claim.margin(outputs, values[None])[0]
@@ -300,7 +300,7 @@ class Search:
             ):
                 cell.reason = "the image's bounds are too wide"
                 if self._coverable(cell.cell):
-                    self._covered(cell)
+                    self._prove_by_sub_boxes(cell)
             else:
                 usable.append(cell)
                 parts.append((*linear, lower, upper, cell.box, cell.outputs))
@@ -315,7 +315,7 @@ class Search:
             for place, cell in enumerate(usable):
                 groups = self._branching(cell, float(margins[place]))
                 if self._divisible(cell.cell) and not margins[place] > 0.0:
-                    cell.parts = self._decided(cell, query, inputs[place : place + 1])
+                    cell.parts = self._decided_parts(cell, query, inputs[place : place + 1])
                 if groups:
                     better = self.model.branch(inputs[place : place + 1], query, groups, _BRANCHES)
                     margins[place] = max(margins[place], better)
@@ -341,7 +341,7 @@ class Search:
             return divided_sets(cell.scene, cell.cell, cell.box)
         return cell.scene.linear_sets(cell.box), None
 
-    def _decided(self, cell: CellSamples, query: Query, images: ImageSets) -> list[CellPart]:
+    def _decided_parts(self, cell: CellSamples, query: Query, images: ImageSets) -> list[CellPart]:
         """Return parts that tile a cell if some are decided (Q8); an open part is bounded again by itself."""
         assert isinstance(self.model, PartsModel)
         question = PartQuestion(self.claim, self.model, query, refute=not self.every_unit)
@@ -363,7 +363,7 @@ class Search:
     def _coverable(self, cell: Cell) -> bool:
         return self.cover is not None and len(cell.first) > 1 and cell.volume > 1
 
-    def _covered(self, cell: CellSamples) -> None:
+    def _prove_by_sub_boxes(self, cell: CellSamples) -> None:
         """Bound a cell sub-box by sub-box, or find how to cut it."""
         weights = self._weights(cell)
         if weights is None or self.cover is None:
@@ -478,7 +478,7 @@ class Search:
         """Return the cell, falsified by a sample in ``box``, which is rendered and classified once more."""
         values, scene_sample = sample
         image = drawn(self.scene, sample)
-        margins, outputs = self._judged([sample], [image])
+        margins, outputs = self._margins_of([sample], [image])
         margin = float(margins[0])
         if not -math.inf < margin <= 0.0 or not box.contains(values):
             return FinishedCell(cell, "unknown", None, 0.0, reason="a counterexample was not confirmed", undecided=True)

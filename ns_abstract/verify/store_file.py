@@ -118,7 +118,7 @@ class StoreFile:
             raise
         except _DAMAGE as error:
             self.close()
-            if isinstance(error, sqlite3.DatabaseError) and (self._fresh or _passes(error)):
+            if isinstance(error, sqlite3.DatabaseError) and (self._fresh or _may_pass(error)):
                 raise self._failure(error) from None
             raise self._damaged(first_line(error)) from None
         except BaseException:
@@ -211,8 +211,8 @@ class StoreFile:
         # a trigger would change rows behind the seals
         with closing(sqlite3.connect(":memory:")) as empty:
             empty.executescript(_SCHEMA)
-            parts = _parts_of(empty)
-        if _parts_of(self._base) != parts:
+            parts = _definitions(empty)
+        if _definitions(self._base) != parts:
             raise self._damaged("its tables are others")
         names_stored = self._base.execute("SELECT * FROM parameters ORDER BY position").fetchall()
         if names_stored != [(k, *names) for k, names in enumerate(parameters)]:
@@ -257,13 +257,13 @@ class StoreFile:
         except sqlite3.Error:
             return
         for name, digest in digests.items():
-            file = self._place(name)
+            file = self._path_of(name)
             if _digest(file) == digest:
                 file.unlink(missing_ok=True)
         with suppress(OSError):
             (self.folder / IMAGES).rmdir()
 
-    def _place(self, name: str) -> Path:
+    def _path_of(self, name: str) -> Path:
         """Return the path of a file beside the store; images of counterexamples have their own folder."""
         file = self.folder / Path(name).name
         return file.parent / IMAGES / file.name if file.suffix == ".npz" else file
@@ -274,7 +274,7 @@ class StoreFile:
 
     def keep(self, name: str, data: bytes) -> Path:
         """Write a file and return its path; another file of that name stays, and this one gets another name."""
-        file, number = self._place(name), 1
+        file, number = self._path_of(name), 1
         wanted = file
 
         def ours() -> bool:
@@ -359,13 +359,13 @@ class StoreFile:
         return None if row is None else json.loads(row[0])
 
 
-def _parts_of(base: sqlite3.Connection) -> set[tuple[str, str, str]]:
+def _definitions(base: sqlite3.Connection) -> set[tuple[str, str, str]]:
     """Return the tables, indices and other objects that a database defines."""
     rows = base.execute("SELECT type, name, sql FROM sqlite_master WHERE sql IS NOT NULL")
     return {(kind, name, " ".join(text.split())) for kind, name, text in rows}
 
 
-def _passes(error: sqlite3.DatabaseError) -> bool:
+def _may_pass(error: sqlite3.DatabaseError) -> bool:
     """Return whether an error means that the file is intact but cannot be used now."""
     return isinstance(error, sqlite3.OperationalError) and any(word in str(error) for word in _PASSING)
 

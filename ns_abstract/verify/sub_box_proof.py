@@ -46,7 +46,7 @@ _PROBE = 4
 #: Looks at a part about the middle of the set before two ways to cover it are compared, and most parts that are told
 #: apart there.
 _TRIALS, _MANY = 4, 1 << 40
-#: Most parts that are bounded together, where rows serve for neighbours and where they do not.
+#: Most parts that are bounded together, where coefficients serve for neighbours and where they do not.
 _GROUP, _JOINED = 64, 8
 #: Times what parts are cut for from which on the network is not asked.
 _ALONE = 1.8
@@ -54,10 +54,10 @@ _ALONE = 1.8
 _DEEP, _MORE = 3, 2.0
 #: Most halvings of a cell that is too wide to be covered at once.
 _CUTS = 6
-#: Part of the margin that is to be left over of a part by its own rows, for them to serve its neighbours; and how much
-#: of what is left more, or less, parts are made dearer for.
+#: Part of the margin that own coefficients have to leave of a part before they serve its neighbours; and how strongly
+#: a margin above or below that raises or lowers the cost that parts may have.
 _SPARE, _STEP = 0.35, 0.6
-#: How many margins a part may miss a proof by for rows of its own before the last activation to help.
+#: How many margins a part may miss a proof by for coefficients of its own before the last activation to help.
 _NEAR = 0.5
 
 
@@ -87,7 +87,7 @@ class PixelWeights:
 
 
 def margin_weights(model: Model, claim: Claim, image: np.ndarray, values: np.ndarray) -> PixelWeights | None:
-    """Return the margin's gradient at a picture [H, W, C] of parameters ``values`` [d]; None where it is not finite."""
+    """Return the gradient at a picture [H, W, C] of parameters ``values`` [d]; None: not finite, or margin <= 0."""
     try:
         picture = torch.from_numpy(image.astype(np.float64)).requires_grad_(True)
         margin = claim.margin(model.differentiable(picture[None]), torch.from_numpy(values)[None])[0]
@@ -142,7 +142,7 @@ class _CellWork:
         asked: Number of sub-boxes that the network was bounded over.
         done: Fraction of the box that is proved, or holds no pose.
         margins: Lower bounds of the margin over what is proved.
-        rows: Coefficients of the latest sub-box that has its own, if they can be reused.
+        shared: Coefficients of the latest sub-box that has its own, if they can be reused.
     """
 
     feasible: Callable[[ParameterBox], ParameterBox | None]
@@ -153,7 +153,7 @@ class _CellWork:
     asked: int = 0
     done: float = 0.0
     margins: list[float] = field(default_factory=list)
-    rows: ModelSharedBounds | None = None
+    shared: ModelSharedBounds | None = None
 
     def learn(self, cost: float, margin: float) -> None:
         """Record the margin that own coefficients prove for a sub-box of this cost."""
@@ -223,7 +223,7 @@ class SubBoxProof:
             return SubBoxOutcome(None, self._cuts(cell, root, effects, cost), 0)
         work = _CellWork(feasible, weights, self.claim.query(outputs[None]), self.aim)
         try:
-            self._all(work, _PendingBox(root, effects, cost, 1.0, 0))
+            self._prove_box(work, _PendingBox(root, effects, cost, 1.0, 0))
         except _StoppedError:
             return SubBoxOutcome(None, self._cuts(cell, root, effects, cost, always=True), work.parts)
         # without a part there is no pose, which cannot be
@@ -246,8 +246,8 @@ class SubBoxProof:
             sets = self._sets(_about_middle(whole, share))
             if sets is None:
                 break
-            rows = self.sharing.shared_bounds(self._images([sets]))
-            margin = float(self._proved(query, rows.first(query), [sets])[0])
+            shared = self.sharing.shared_bounds(self._images([sets]))
+            margin = float(self._proved(query, shared.first(query), [sets])[0])
             first = margin if share == _TUNING.least_share else first
             if not (first > 0.0 and margin > _SPARE * first):
                 break
@@ -276,17 +276,17 @@ class SubBoxProof:
         picture_sets = PictureSets(box, linear, lower, upper)
         return picture_sets if picture_sets.sane else None
 
-    def _all(self, work: _CellWork, node: _PendingBox) -> None:
+    def _prove_box(self, work: _CellWork, node: _PendingBox) -> None:
         """Prove a box, in groups of sub-boxes."""
         counts = divisions(node.effects, node.cost, work.aim, self.most_parts)
         if math.prod(counts) > (_GROUP if self.sharing.reusable_anywhere else _JOINED):
             for half in node.parts(int(np.argmax(counts)), 2):
-                self._all(work, half)
+                self._prove_box(work, half)
             return
         parts = [node]
         for axis, count in enumerate(counts):
             parts = [part for whole in parts for part in whole.parts(axis, count)]
-        self._group(work, parts)
+        self._prove_group(work, parts)
 
     def _feasible(self, work: _CellWork, nodes: Iterable[_PendingBox]) -> list[_PendingBox]:
         """Return the sub-boxes, each reduced to the poses of the cell in it; those without poses are done."""
@@ -299,51 +299,51 @@ class SubBoxProof:
                 feasible_boxes.append(replace(node, box=box))
         return feasible_boxes
 
-    def _group(self, work: _CellWork, nodes: Sequence[_PendingBox]) -> None:
+    def _prove_group(self, work: _CellWork, nodes: Sequence[_PendingBox]) -> None:
         """Prove neighbouring sub-boxes."""
         nodes = self._feasible(work, nodes)
         if not nodes:
             return
-        parts = self._bounded(work, nodes)
+        parts = self._picture_sets(work, nodes)
         costs = np.array([work.weights.loss(sets, self.opening) for sets in parts])
         margins = np.full(len(parts), -np.inf)
-        expensive = np.flatnonzero(costs < _ALONE * work.aim).tolist()
-        if expensive:
-            work.asked += len(expensive)
-            margins[expensive] = self._together(work, [parts[k] for k in expensive], costs[expensive])
+        affordable = np.flatnonzero(costs < _ALONE * work.aim).tolist()
+        if affordable:
+            work.asked += len(affordable)
+            margins[affordable] = self._together(work, [parts[k] for k in affordable], costs[affordable])
         halves: list[_PendingBox] = []
-        for k, part in self._left(work, nodes, margins):
-            # as expensive as what fails
+        for k, part in self._unproved(work, nodes, margins):
+            # at least as expensive as a part that fails
             cost = max(float(costs[k]), work.aim)
             rest = _PendingBox(part.box, work.weights.effects(parts[k]), cost, part.share, part.depth + 1)
             halves += rest.parts(int(np.argmax(rest.effects)), 2)
         for first in range(0, len(halves), _GROUP):
-            self._group(work, halves[first : first + _GROUP])
+            self._prove_group(work, halves[first : first + _GROUP])
 
     def _together(self, work: _CellWork, parts: Sequence[PictureSets], costs: np.ndarray) -> np.ndarray:
         """Return margins [m] of sub-boxes, with as few backward passes as possible."""
         if not self.sharing.reusable_anywhere:
-            return self._joined(work, parts, costs)
+            return self._prove_by_hull(work, parts, costs)
         margins = np.full(len(parts), -np.inf)
-        if work.rows is not None:
-            self._lent(work, work.rows, parts, margins)
+        if work.shared is not None:
+            self._prove_by_shared(work, work.shared, parts, margins)
         middles = np.array([sets.box.middle for sets in parts])
         size = np.maximum(np.array(parts[0].box.upper) - np.array(parts[0].box.lower), NONZERO)
         while len(left := np.flatnonzero(~(margins > 0.0))):
             # the middle one serves most
             at = middles[left] / size
             chosen = int(left[np.abs(at - at.mean(axis=0)).sum(axis=1).argmin()])
-            rows = self.sharing.shared_bounds(self._images([parts[chosen]]))
-            margins[chosen] = self._proved(work.query, rows.first(work.query), [parts[chosen]])[0]
+            shared = self.sharing.shared_bounds(self._images([parts[chosen]]))
+            margins[chosen] = self._proved(work.query, shared.first(work.query), [parts[chosen]])[0]
             work.learn(float(costs[chosen]), float(margins[chosen]))
             if not margins[chosen] > 0.0:
                 break
-            work.rows = rows
-            self._lent(work, rows, parts, margins)
+            work.shared = shared
+            self._prove_by_shared(work, shared, parts, margins)
         return margins
 
-    def _lent(
-        self, work: _CellWork, rows: ModelSharedBounds, parts: Sequence[PictureSets], margins: np.ndarray
+    def _prove_by_shared(
+        self, work: _CellWork, shared: ModelSharedBounds, parts: Sequence[PictureSets], margins: np.ndarray
     ) -> None:
         """Fill in ``margins`` of sub-boxes without one, by another sub-box's coefficients."""
         for fresh in (False, True):
@@ -353,19 +353,19 @@ class SubBoxProof:
             if left:
                 chosen = [parts[k] for k in left]
                 margins[left] = self._proved(
-                    work.query, rows.others(self._images(chosen), work.query, fresh=fresh), chosen
+                    work.query, shared.others(self._images(chosen), work.query, fresh=fresh), chosen
                 )
 
-    def _joined(self, work: _CellWork, parts: Sequence[PictureSets], costs: np.ndarray) -> np.ndarray:
+    def _prove_by_hull(self, work: _CellWork, parts: Sequence[PictureSets], costs: np.ndarray) -> np.ndarray:
         """Return margins [m] of sub-boxes, by coefficients of sets that contain all of them."""
         whole = hull_of_sets(parts)
-        rows = self.sharing.shared_bounds(self._images([whole]))
-        margins = np.full(len(parts), self._proved(work.query, rows.first(work.query), [whole])[0])
+        shared = self.sharing.shared_bounds(self._images([whole]))
+        margins = np.full(len(parts), self._proved(work.query, shared.first(work.query), [whole])[0])
         work.learn(float(costs.mean()), float(margins[0]))
-        self._lent(work, rows, parts, margins)
+        self._prove_by_shared(work, shared, parts, margins)
         return margins
 
-    def _bounded(self, work: _CellWork, nodes: Sequence[_PendingBox]) -> list[PictureSets]:
+    def _picture_sets(self, work: _CellWork, nodes: Sequence[_PendingBox]) -> list[PictureSets]:
         """Return sets of sub-boxes. Raises _StoppedError: there are too many, or one has none."""
         work.parts += len(nodes)
         late = work.asked > self.most_parts // 2 and work.asked > _MORE * self.most_parts * work.done
@@ -379,7 +379,7 @@ class SubBoxProof:
             parts.append(sets)
         return parts
 
-    def _left(
+    def _unproved(
         self, work: _CellWork, nodes: Sequence[_PendingBox], margins: np.ndarray
     ) -> list[tuple[int, _PendingBox]]:
         """Return the ``nodes`` without proof, with their numbers; the others are done."""

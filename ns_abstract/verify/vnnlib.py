@@ -65,7 +65,7 @@ class _Run:
     def read(self, declared: set[str], size: _VariableCounts) -> None:
         """Parse the texts into ``limits``."""
         for text in set(self.texts).difference(self.limits):
-            ((constraint,),) = _ways(_expressions(text + ")")[0], declared, size)
+            ((constraint,),) = _disjunction(_expressions(text + ")")[0], declared, size)
             assert not isinstance(constraint, _Run)
             ends = np.array([[-np.inf], [np.inf]]) * np.ones(size.inputs or 0)
             _bound(constraint, ends)
@@ -173,7 +173,7 @@ def _regions(expressions: list[Any], sizes: _VariableCounts) -> tuple[InputRegio
         check_cancelled()
         if _declares(expression, declared):
             continue
-        ways = _ways(expression[1], declared, sizes)
+        ways = _disjunction(expression[1], declared, sizes)
         if len(ways) == 1:
             rest = [v for v in ways[0] if not _bound(v, ends)]
             cases = [[*case, *rest] for case in cases] if rest else cases
@@ -285,7 +285,7 @@ def _parse(expressions: list[Any], output_size: int, input_size: int | None) -> 
         if names == {"X"}:
             inputs += 1
             continue
-        ways = _ways(expression[1], declared, _VariableCounts(None, output_size))
+        ways = _disjunction(expression[1], declared, _VariableCounts(None, output_size))
         if len(unsafe) * len(ways) > _CONJUNCTIONS:
             raise InputError(f"more than {_CONJUNCTIONS} combinations of cases", fix="use fewer assertions of (or")
         unsafe = [[*old, *new] for old in unsafe for new in ways]
@@ -351,18 +351,18 @@ def _names(expression: Any) -> set[str]:
     return {expression} if _VARIABLE.fullmatch(expression) else set()
 
 
-def _ways(expression: Any, declared: set[str], size: _VariableCounts) -> list[_Conjunction]:
+def _disjunction(expression: Any, declared: set[str], size: _VariableCounts) -> list[_Conjunction]:
     """Return the expression as a disjunction of conjunctions."""
     head = expression[0] if isinstance(expression, list) and expression else None
     if head == "or" and len(expression) > 1:
-        return [way for part in expression[1:] for way in _ways(part, declared, size)]
+        return [way for part in expression[1:] for way in _disjunction(part, declared, size)]
     if head == "and" and len(expression) > 1:
         check_cancelled()
         ways: list[_Conjunction] = [[]]
         for part in expression[1:]:
             if isinstance(part, _Run):
                 part.read(declared, size)
-            more: list[_Conjunction] = [[part]] if isinstance(part, _Run) else _ways(part, declared, size)
+            more: list[_Conjunction] = [[part]] if isinstance(part, _Run) else _disjunction(part, declared, size)
             if len(more) == 1:
                 for way in ways:
                     way += more[0]

@@ -74,7 +74,7 @@ class _ImageExtremes:
         self.most = np.full(shape, -np.inf)
         self.least_at = np.full(shape, -1)
         self.most_at = np.full(shape, -1)
-        self.found: dict[tuple[int, int, int], Violation] = {}
+        self.worst_by_channel: dict[tuple[int, int, int], Violation] = {}
         bad = ~(np.isfinite(self.lower) & np.isfinite(self.upper))
         self.not_finite += int(bad.sum())
         self.violations += int(bad.sum())
@@ -85,9 +85,9 @@ class _ImageExtremes:
 
     def _keep(self, violation: Violation) -> None:
         place = (violation.row, violation.column, violation.channel)
-        current = self.found.get(place)
+        current = self.worst_by_channel.get(place)
         if current is None or _severity(violation) > _severity(current):
-            self.found[place] = violation
+            self.worst_by_channel[place] = violation
 
     def image(self, values: Float64Array, strategy: str) -> Float64Array:
         """Render and compare one pose."""
@@ -204,7 +204,7 @@ class _ImageExtremes:
         return np.array(unique, np.float64).reshape(len(unique), self.box.dimensions)
 
     def attack(self, seconds: float) -> Attack:
-        worst = sorted(self.found.values(), key=_severity, reverse=True)[:KEPT]
+        worst = sorted(self.worst_by_channel.values(), key=_severity, reverse=True)[:KEPT]
         unseen = self.most < self.least
         return Attack(
             poses=len(self.poses),
@@ -245,22 +245,22 @@ def _corners(box: ParameterBox, count: int, generator: np.random.Generator) -> F
     return np.where(bits == 1, np.array(box.upper), np.array(box.lower))
 
 
-def _ascend(record: _ImageExtremes, twin: DifferentiableRender, target: _Target, start: Float64Array) -> Float64Array:
+def _ascend(extremes: _ImageExtremes, twin: DifferentiableRender, target: _Target, start: Float64Array) -> Float64Array:
     """Return the final pose of projected gradient ascent of one pixel channel."""
     pixel = torch.tensor([[target.row, target.column]])
 
     def value(values: torch.Tensor) -> torch.Tensor:
-        record.steps += 1
+        extremes.steps += 1
         return -target.sign * twin(values, pixel)[0, target.channel]
 
-    end = descend(record.box, start, value, _ASCENT_STEPS, lambda _: time.perf_counter() >= record.deadline)
+    end = descend(extremes.box, start, value, _ASCENT_STEPS, lambda _: time.perf_counter() >= extremes.deadline)
     return start if end is None else end
 
 
-def _jump(record: _ImageExtremes, probe: RenderPixels | None, target: _Target, generator: np.random.Generator) -> None:
+def _jump(extremes: _ImageExtremes, probe: RenderPixels | None, target: _Target, random: np.random.Generator) -> None:
     """Search for a jump of the target on a random line through its pose, and render both sides of it."""
-    low, high = np.array(record.box.lower), np.array(record.box.upper)
-    direction = generator.normal(size=low.size) * (high - low)
+    low, high = np.array(extremes.box.lower), np.array(extremes.box.upper)
+    direction = random.normal(size=low.size) * (high - low)
     # the line's ends in the box
     with np.errstate(divide="ignore", invalid="ignore"):
         ends = np.stack([(low - target.pose) / direction, (high - target.pose) / direction])
@@ -273,7 +273,7 @@ def _jump(record: _ImageExtremes, probe: RenderPixels | None, target: _Target, g
     def at(place: float) -> Float64Array:
         return np.clip(target.pose + place * direction, low, high)
 
-    values = [record.pixel(probe, at(place), target) for place in places]
+    values = [extremes.pixel(probe, at(place), target) for place in places]
     k = int(np.argmax(np.abs(np.diff(values))))
     a, b, value_a, value_b = places[k], places[k + 1], values[k], values[k + 1]
     difference = abs(value_b - value_a)
@@ -285,14 +285,14 @@ def _jump(record: _ImageExtremes, probe: RenderPixels | None, target: _Target, g
         middle = 0.5 * (a + b)
         if not (min(a, b) < middle < max(a, b)) or np.array_equal(at(a), at(b)):
             break
-        value = record.pixel(probe, at(middle), target)
+        value = extremes.pixel(probe, at(middle), target)
         # the half with the larger difference holds the larger jump
         if abs(value - value_a) >= abs(value_b - value):
             b, value_b = middle, value
         else:
             a, value_a = middle, value
-    record.image_once(at(a), "jumps")
-    record.image_once(at(b), "jumps")
+    extremes.image_once(at(a), "jumps")
+    extremes.image_once(at(b), "jumps")
 
 
 def falsify(
@@ -326,18 +326,18 @@ def falsify(
     if unknown:
         raise ValueError(f"unknown strategies {sorted(unknown)}; there are {', '.join(STRATEGIES)}")
     began = time.perf_counter()
-    record = _ImageExtremes(lower, upper, box, render, poses, began + seconds)
+    extremes = _ImageExtremes(lower, upper, box, render, poses, began + seconds)
     generator = np.random.default_rng(seed)
     used = [name for name in strategies if name != "ascent" or twin is not None]
     try:
-        _search(record, twin, probe, generator, np.zeros((0, 0)) if starts is None else np.asarray(starts), used)
+        _search(extremes, twin, probe, generator, np.zeros((0, 0)) if starts is None else np.asarray(starts), used)
     except _BudgetSpentError:
         pass
-    return record.attack(time.perf_counter() - began)
+    return extremes.attack(time.perf_counter() - began)
 
 
 def _search(
-    record: _ImageExtremes,
+    extremes: _ImageExtremes,
     twin: DifferentiableRender | None,
     probe: RenderPixels | None,
     generator: np.random.Generator,
@@ -345,51 +345,51 @@ def _search(
     strategies: Sequence[str],
 ) -> None:
     """Run the strategies one after the other until the budget is spent."""
-    box, limit = record.box, record.limit
+    box, limit = extremes.box, extremes.limit
 
     def share(name: str) -> int:
         """Poses of the rest that a strategy may use; all of it for the last one."""
-        rest = limit - len(record.poses)
+        rest = limit - len(extremes.poses)
         later = STRATEGIES[STRATEGIES.index(name) + 1 :]
         return max(1, round(_SHARES[name] * rest)) if any(s in strategies for s in later) else rest
 
     if "given" in strategies:
         for values in starts:
-            record.image(values, "given")
+            extremes.image(values, "given")
     if "corners" in strategies:
         count = share("corners")
-        record.image(box.middle, "corners")
+        extremes.image(box.middle, "corners")
         for values in _corners(box, count - 1, generator):
-            record.image(values, "corners")
+            extremes.image(values, "corners")
     if box.dimensions == 0:
         return
     if "random" in strategies:
         for values in box.sample(share("random"), generator):
-            record.image(values, "random")
-    if "ascent" in strategies and twin is not None and record.poses:
+            extremes.image(values, "random")
+    if "ascent" in strategies and twin is not None and extremes.poses:
         # an ascent that ends where an image was rendered before (often a corner) costs no pose
         count = share("ascent")
-        last, climbs = len(record.poses) + count, 4 * count
+        last, climbs = len(extremes.poses) + count, 4 * count
         done: set[int] = set()
-        while len(record.poses) < last and climbs > 0:
+        while len(extremes.poses) < last and climbs > 0:
             # a few at a time, so that later targets profit from earlier poses
-            targets = record.targets(9, generator, done)
+            targets = extremes.targets(9, generator, done)
             if not targets:
                 break
             pairs = [(target, start) for target in targets for start in (target.pose, box.sample(1, generator)[0])]
             for target, start in pairs:
-                if len(record.poses) < last:
-                    record.image_once(_ascend(record, twin, target, start), "ascent")
+                if len(extremes.poses) < last:
+                    extremes.image_once(_ascend(extremes, twin, target, start), "ascent")
                 climbs -= 1
-    if "jumps" in strategies and record.poses:
-        while targets := record.targets(3, generator, set()):
-            before = len(record.poses)
+    if "jumps" in strategies and extremes.poses:
+        while targets := extremes.targets(3, generator, set()):
+            before = len(extremes.poses)
             for target in targets:
-                _jump(record, probe, target, generator)
-            if len(record.poses) == before:
+                _jump(extremes, probe, target, generator)
+            if len(extremes.poses) == before:
                 # no jump along these lines
-                record.image(box.sample(1, generator)[0], "random")
+                extremes.image(box.sample(1, generator)[0], "random")
     if "random" in strategies:
         # nothing moved enough to be searched
         while True:
-            record.image(box.sample(1, generator)[0], "random")
+            extremes.image(box.sample(1, generator)[0], "random")

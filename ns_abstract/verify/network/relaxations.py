@@ -31,7 +31,7 @@ class MaxPoolPlanes(NamedTuple):
     offsets: np.ndarray
 
     def forward(self, layer: MaxPool, cell: int, coefficients: Tensor, inputs: list[Tensor]) -> Tensor:
-        """Return the planes that ``coefficients`` [R, C, H, W] apply, at inputs [R, C, H', W'] of one cell."""
+        """Return values at a cell's inputs [R, C, H', W'] of the planes that ``coefficients`` [R, C, H, W] choose."""
         taps = layer.taps(inputs[0], 0.0)
         winner = torch.from_numpy(self.winner[cell].astype(np.int64)).flatten(1)[None, :, None]
         value = taps.gather(2, winner.expand(len(taps), -1, -1, -1))[:, :, 0]

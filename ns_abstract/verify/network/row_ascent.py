@@ -133,7 +133,7 @@ class RowAscent:
 
 
 def _product(one: Tensor, two: Tensor, coefficients: Tensor, inputs: list[Tensor]) -> Tensor:
-    """Return the planes of a product that ``coefficients`` apply, at its factors."""
+    """Return values, at the factors, of the planes of a product that ``coefficients`` choose."""
     x, y = (v.reshape(coefficients.shape) for v in inputs)
     offset = torch.where(coefficients >= 0.0, one[1] + two[1], one[4] + two[4])
     return one[0] * x + two[0] * y + offset

@@ -186,8 +186,8 @@ def exp_band(center, low, high):
     """Return a polynomial and a rest that enclose ``exp`` on an interval (design.md, H5).
 
     ``low <= center <= high``. Returns v, slope, curvature, rest: ``|exp(center + t) - v - slope t - curvature t^2| <=
-    rest`` where ``center + t`` is in the interval; the curvature is not negative. All are infinite where the function
-    may overflow.
+    rest`` where ``center + t`` is in the interval; the curvature is not negative. Where the function may overflow,
+    only the rest is not 0: it is infinite.
     """
     if not (high < _MOST and low <= high):
         return 0.0, 0.0, 0.0, np.inf
