@@ -70,7 +70,7 @@ class ChebyshevBasis:
 
     @cached_property
     def interpolation(self) -> tuple[Float64Array, Float64Array]:
-        """Coefficients of the interpolant: [m, nodes] those of the basis, [rest, nodes] those above its degree."""
+        """Matrices from node values to coefficients of an interpolant: [m, nodes] of the basis, [rest, nodes] above."""
         n = self.degree + 1
         by_axis = chebyshev_values(np.cos(np.pi * (np.arange(n) + 0.5) / n), self.degree).T * (2.0 / n)
         by_axis[0] *= 0.5
@@ -84,7 +84,7 @@ class ChebyshevBasis:
 
     @cached_property
     def interpolation_rounding(self) -> float:
-        """What an interpolant's coefficients are off by together, in parts of the largest value at a node (F3)."""
+        """Bound of the summed rounding errors of an interpolant's coefficients, by the largest value at a node (F3)."""
         size = sum(float(np.abs(matrix).sum()) for matrix in self.interpolation)
         return gamma(len(self.nodes) + INTERPOLATION_ROUNDINGS) * size * GRID_UP
 
@@ -112,7 +112,7 @@ class ChebyshevBasis:
 
     @property
     def norming(self) -> float:
-        """A polynomial's largest absolute value over the largest on the grid, at most (Ehlich and Zeller 1964)."""
+        """Bound of max |polynomial| on [-1, 1]^d divided by its maximum on the grid (Ehlich and Zeller 1964)."""
         return math.cos(0.5 * math.pi * self.degree / self.grid) ** -self.dimensions * GRID_UP
 
     @cached_property

@@ -1,4 +1,4 @@
-"""How far kernels are compiled, in words."""
+"""Lines of text that report the progress of compiling kernels."""
 
 from __future__ import annotations
 
@@ -6,10 +6,10 @@ import time
 
 
 class CompileProgress:
-    """Lines on progress, with an estimate by measured seconds and by the functions that are done, whichever is later.
+    """Makes lines on the progress of compiling, with the larger estimate by seconds and by functions done.
 
-    ``functions``: of all kernels, about. ``seconds``: that compiling them took where it was measured. ``pace``: seconds
-    between two lines.
+    ``functions``: about how many functions all kernels have. ``seconds``: how long compiling them took when it was
+    measured. ``pace``: seconds between two lines.
     """
 
     def __init__(self, functions: int, seconds: float, pace: float) -> None:
@@ -18,7 +18,7 @@ class CompileProgress:
         self._shown = self._begin
 
     def line(self, done: int) -> str:
-        """What to tell when so many functions are done."""
+        """Return the line to print when ``done`` functions are compiled."""
         used = time.monotonic() - self._begin
         done = min(done, self.functions)
         # the first ones say little about the others, but more than a time that is over

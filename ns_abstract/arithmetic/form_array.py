@@ -39,7 +39,7 @@ class FormArray:
 
     @classmethod
     def constant(cls, basis: Basis, values: Float64Array | float, radius: Float64Array | float = 0.0) -> FormArray:
-        """Forms that are the numbers ``values`` up to ``radius``."""
+        """Constant forms of the numbers ``values``, each enclosing a ``radius`` around its number."""
         values = np.asarray(values, dtype=np.float64)
         data = np.zeros((basis.rows, values.size))
         data[0] = values.ravel()
@@ -66,7 +66,7 @@ class FormArray:
 
     @property
     def radius(self) -> Float64Array:
-        """Radius of the part that is not polynomial."""
+        """Radius of each form: a bound of its non-polynomial part."""
         return self.data[self.basis.monomials].reshape(self.shape)
 
     @property
@@ -180,7 +180,7 @@ class FormArray:
         return FormArray(self.basis, out, self.shape)
 
     def reciprocal(self) -> FormArray:
-        """Element-wise ``1 / x``; the radius is not finite where ``x`` may be 0 or below."""
+        """Element-wise ``1 / x``; the radius is not finite unless bounds show ``x`` in `forms.reciprocal`'s range."""
         return self._unary(reciprocal)
 
     def sqrt(self) -> FormArray:
@@ -192,7 +192,7 @@ class FormArray:
         return self._unary(reciprocal_square_root)
 
     def compose(self, f0, f1, f2_low, f2_high, f3) -> FormArray:
-        """See the kernel `compose`; arguments broadcast against ``shape``."""
+        """Element-wise ``f(x)`` by the kernel `compose`; f0 to f3 as there, broadcast against ``shape``."""
         values = np.empty((5, *self.shape))
         for row, value in enumerate((f0, f1, f2_low, f2_high, f3)):
             values[row] = value

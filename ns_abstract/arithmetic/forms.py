@@ -274,7 +274,7 @@ def bounds(a, low, high, d, order, m):
 
 @njit(cache=True, error_model="numpy", inline="always")
 def _ends(a, m, q):
-    """Lower and upper bounds of a positive quantity, and whether functions of it are evaluated there."""
+    """Lower and upper bounds of form ``q``, and whether SMALLEST < lower < LARGEST, where functions are defined."""
     c = a[0, q]
     e = (a[m + 1, q] + a[m + 2, q] + a[m, q]) * UP
     low = (c - e) * (1.0 - FORM_ROUNDING)

@@ -74,13 +74,13 @@ def source_key() -> str:
 
 
 class KernelMissingError(Exception):
-    """A kernel is not kept, where none may be compiled."""
+    """Raised inside `KernelStore.complete` for a kernel that is not in the cache."""
 
 
 class KernelStore:
-    """The kernels of one version of the sources, ``key``, as one process sees them in the folder ``root``.
+    """One process' cache, in the folder ``root``, of the kernels of the sources whose hash is ``key``.
 
-    ``session``: that of the process that this one compiles for; None: one of its own.
+    ``session``: the session folder of the process that this one compiles for; None: a folder of its own.
 
     Raises:
         OSError: ``root`` cannot be written.
@@ -115,18 +115,18 @@ class KernelStore:
 
     @property
     def empty(self) -> bool:
-        """Whether nothing was kept when this process began."""
+        """Whether the cache held no kernel of this version when the process began."""
         return not self._entries
 
     def also_from(self, folder: Path, shipped: bool = False) -> None:
-        """Take what is missing from a version's folder that is not written to, or that was ``shipped`` for a level."""
+        """Add a read-only ``folder`` from which missing kernels are read; ``shipped``: for a processor level."""
         self._sources.append(folder)
         if shipped:
             self._shipped = folder
         self._entries = _read_manifest(folder) | self._entries
 
     def fetch(self, place: str, stamp: str) -> str:
-        """The session's folder of one module, with what is kept of its functions; damaged files are left out."""
+        """Return the session's folder for a module, with the cached files of its functions, but no damaged ones."""
         folder = self.session / place
         if not folder.exists():
             with _locked(self.session / "lock"):
@@ -137,7 +137,7 @@ class KernelStore:
 
     @contextmanager
     def complete(self) -> Iterator[None]:
-        """Inside, a kernel that is not kept raises `KernelMissingError` instead of being compiled."""
+        """Context in which a kernel that is not cached raises `KernelMissingError` instead of being compiled."""
         self._complete = True
         try:
             yield
@@ -145,13 +145,13 @@ class KernelStore:
             self._complete = False
 
     def claim(self, kernel: str, load: Callable[[], Any]) -> Any:
-        """What ``load`` returns now, or once no other process of this session compiles the kernel; None: compile it.
+        """Return the kernel that ``load`` finds, after another process compiled it if one does; None: compile it here.
 
-        Until `saved` is called, others wait for this process. They do not wait for each other in a circle, since
-        kernels do not call each other in one.
+        After None, others wait for this process until it calls `saved`. They do not wait for each other in a circle,
+        since kernels do not call each other in one.
 
         Raises:
-            KernelMissingError: It is not kept, inside `complete`.
+            KernelMissingError: It is not cached, inside `complete`.
         """
         loaded = load()
         if loaded is None and self._complete:
@@ -167,7 +167,7 @@ class KernelStore:
         return loaded
 
     def saved(self, kernel: str, save: Callable[[], Any]) -> None:
-        """Have ``save`` write a kernel that was compiled, and let others have it."""
+        """Call ``save`` to write a kernel that was compiled here, and release it for the session's other processes."""
         if not self.shared:
             save()
             return
@@ -176,7 +176,7 @@ class KernelStore:
             save()
 
     def _link(self, place: str, stamp: str) -> None:
-        """Bring what is kept of a module's functions into the session's folder."""
+        """Link the cached files of a module's functions into the session's folder."""
         folder = self.session / place
         for name, wanted in self._entries.items():
             if name.rpartition("/")[0] != place or (folder / f"{name.rpartition('/')[2]}.nbi").exists():
@@ -205,7 +205,7 @@ class KernelStore:
         return None
 
     def publish(self) -> None:
-        """Keep what this process has compiled."""
+        """Add the kernels that this process has compiled to the cache."""
         changed: dict[str, dict[str, str]] = {}
         for index in self.session.rglob("*.nbi"):
             base = index.name.removesuffix(".nbi")
@@ -229,7 +229,7 @@ class KernelStore:
         return digest
 
     def before_saving(self) -> None:
-        """A kernel was compiled and is about to be written to the session's folder.
+        """Check the disk and count the kernel before a compiled one is written to the session's folder.
 
         Raises:
             InputError: The disk is full.
@@ -245,7 +245,7 @@ class KernelStore:
 
     @contextmanager
     def expecting(self, functions: int, seconds: float) -> Iterator[None]:
-        """Inside, progress is told of so many functions, about, that take so many seconds; of 0 nothing is known."""
+        """Context that prints progress for about ``functions`` functions to compile in ``seconds``; 0: not known."""
         self._progress = CompileProgress(functions, seconds, _PACE) if functions else None
         self._before, self._said = self.functions, time.monotonic()
         try:
@@ -254,7 +254,7 @@ class KernelStore:
             self._progress = None
 
     def function_done(self) -> None:
-        """A kernel, or a function that one calls, was compiled."""
+        """Count one more compiled function, a kernel or one that a kernel calls, for the progress."""
         self.functions += 1
         self.latest = time.perf_counter()
         now = time.monotonic()
@@ -292,7 +292,7 @@ class KernelStore:
 
 
 def _read_manifest(folder: Path) -> dict[str, dict[str, str]]:
-    """Files of every function and their digests; empty where there is none or it is damaged."""
+    """Return a manifest: by function, its files and their SHA-256; empty if the manifest is missing or damaged."""
     try:
         manifest = json.loads((folder / "manifest.json").read_bytes())
     except (OSError, ValueError, RecursionError):
@@ -321,7 +321,7 @@ def _stamp(path: Path) -> tuple[int, int]:
 
 
 def _in_use(session: Path) -> bool:
-    """Whether the process of a session's folder may still live; nobody knows of other machines'."""
+    """Whether the process of a session's folder may still run; true for processes of other machines."""
     host, process = session.name.removeprefix("session-").rsplit("-", 2)[:2]
     return host != socket.gethostname() or not process.isdigit() or _alive(int(process))
 
@@ -405,7 +405,7 @@ def _kernel_module(file: str) -> tuple[str, str] | None:
 
 
 class KernelLocator:
-    """Tells numba where the kernels of this package are kept (its interface of cache locators)."""
+    """numba's cache locator for this package's kernels: names the folder of their files."""
 
     def __init__(self, py_func: Any, place: str, stamp: str) -> None:
         self._line = py_func.__code__.co_firstlineno
@@ -423,15 +423,15 @@ class KernelLocator:
         return self._path
 
     def get_source_stamp(self) -> str:
-        """What the files belong to."""
+        """Return the hash of the sources that the cached files belong to."""
         return self._stamp
 
     def get_disambiguator(self) -> str:
-        """Tells functions of one name apart."""
+        """Return a text that distinguishes functions of one name."""
         return str(self._line)
 
     def ensure_cache_path(self) -> None:
-        """Called before a compiled function is written."""
+        """Make the folder and check the disk; numba calls this before it writes a compiled function."""
         # makes it again where it was cleared away
         self.get_cache_path()
         store().before_saving()
@@ -441,7 +441,7 @@ _load, _save = FunctionCache.load_overload, FunctionCache.save_overload
 
 
 def _kernel(cache: FunctionCache, signature: Any) -> str | None:
-    """Names a kernel of this package, or None."""
+    """Return the name of one of this package's kernels with a signature; None: the function is no kernel of it."""
     if not isinstance(cache._impl.locator, KernelLocator):  # pyright: ignore[reportAttributeAccessIssue]
         return None
     return f"{cache.cache_path} {cache._impl.filename_base} {signature}"  # pyright: ignore[reportAttributeAccessIssue]
@@ -466,7 +466,7 @@ def _save_overload(cache: FunctionCache, signature: Any, data: Any) -> None:
 
 
 def install() -> None:
-    """Have numba ask `KernelLocator` first, and `KernelStore` before it compiles a kernel."""
+    """Make numba use `KernelLocator` for cache folders, and ask `KernelStore` before it compiles a kernel."""
     FunctionCache.load_overload = _load_overload  # pyright: ignore[reportAttributeAccessIssue]
     FunctionCache.save_overload = _save_overload  # pyright: ignore[reportAttributeAccessIssue]
     ours = f"{KernelLocator.__module__}.{KernelLocator.__name__}"

@@ -35,7 +35,7 @@ _NEEDED = (
 
 
 class LinkedOnly:
-    """Stands for the address of a function that has no machine code: a key of numba's tables."""
+    """Placeholder, in numba's tables, for the address of a function without machine code."""
 
 
 @dataclass
@@ -63,7 +63,10 @@ def _linked_only(result: Any) -> bool:
 
 
 def install(done: Callable[[], object]) -> None:
-    """Have numba compile so, and call ``done`` after each function, where it has the parts that this replaces."""
+    """Make numba link kernels as this module describes, if its version has the parts that are replaced.
+
+    ``done`` is called after each compiled function.
+    """
     if not numba.__version__.startswith(_TRIED) or not all(hasattr(owner, name) for owner, name in _NEEDED):
         return
     _compilation.done = done
@@ -129,7 +132,7 @@ def install(done: Callable[[], object]) -> None:
 
 @contextmanager
 def _uncollected() -> Iterator[None]:
-    """No search for garbage inside: a compilation makes millions of objects and keeps them until it ends."""
+    """Context without garbage collection: a compilation makes millions of objects and keeps them until it ends."""
     enabled = gc.isenabled()
     gc.disable()
     try:

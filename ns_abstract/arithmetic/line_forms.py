@@ -15,7 +15,7 @@ from ns_abstract.arithmetic.rounding import FORM_ROUNDING, LARGEST, RANGE_ROUNDI
 
 
 class LineForm(NamedTuple):
-    """``center + slope p + bend p^2`` and what is at most ``radius`` away from it, over p in [-1, 1]."""
+    """All functions of p in [-1, 1] within ``radius`` of the polynomial ``center + slope p + bend p^2``."""
 
     center: float
     slope: float
@@ -74,7 +74,7 @@ def composed(a, f0, f1, f2, f3):
 
 @njit(cache=True, error_model="numpy", inline="always")
 def _least(a):
-    """Lower bound of a positive quantity, and whether it lies where the functions below are evaluated."""
+    """Lower bound of a form, and whether it lies in the range where the functions below are defined."""
     low = (a.center - (abs(a.slope) + abs(a.bend) + a.radius) * UP) * (1.0 - FORM_ROUNDING)
     return low, (low > SMALLEST) & (low < LARGEST)
 

@@ -170,7 +170,7 @@ def gamma(count: Any, unit: float | None = None) -> Any:
     """Return the relative error of ``count`` roundings (a number or a tensor), in float32 by default.
 
     Raises:
-        InputError: They leave no digit.
+        InputError: ``count`` times the unit reaches 1/2: no digit is left.
     """
     unit = UNIT if unit is None else unit
     product = count * unit

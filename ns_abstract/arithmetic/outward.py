@@ -1,4 +1,4 @@
-"""Bounds in single precision."""
+"""Bounds rounded outward to float32."""
 
 from __future__ import annotations
 
@@ -12,12 +12,12 @@ _SHARED = 1 << 18
 
 
 def outward(lower: np.ndarray, upper: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Float32 neighbours of ``lower`` from below and ``upper`` from above."""
+    """Return ``lower`` rounded down and ``upper`` rounded up to float32."""
     return _beside(lower, 1.0), _beside(upper, -1.0)
 
 
 def _beside(values: np.ndarray, sign: float) -> np.ndarray:
-    """The nearest float32 numbers that are not above ``values``; not below for ``sign`` -1."""
+    """Return ``values`` rounded down to float32, or up for ``sign`` -1."""
     values = np.ascontiguousarray(values, np.float64)
     neighbours = np.empty(values.shape, np.float32)
     flat, out = values.reshape(-1), neighbours.reshape(-1)
@@ -29,7 +29,7 @@ def _beside(values: np.ndarray, sign: float) -> np.ndarray:
 
 @njit(cache=True, error_model="numpy", nogil=True)
 def _round_towards(values, sign, out):
-    """``sign * out <= sign * values`` [n], as large as float32 allows; ``sign`` is 1 or -1."""
+    """Write to ``out`` [n] the largest float32 numbers with ``sign * out <= sign * values``; ``sign`` is 1 or -1."""
     for q in range(values.size):
         value = sign * values[q]
         nearest = np.float32(value)

@@ -373,16 +373,16 @@ def taylor_product_rounding(monomials: int) -> float:
 
 @dataclass(frozen=True)
 class Arithmetic:
-    """What the bounded program computes with.
+    """The floating-point arithmetic of the program whose pictures are bounded, as error constants.
 
-    Every error is in units of ``unit``; the pair ``(unit, flush)`` says which floating-point
-    evaluations of the gsplat formulas the bounds enclose. The real-number renderer and the
-    package's own float64 evaluation are enclosed in both cases.
+    Every error is in units of ``unit``; the pair ``(unit, flush)`` says which floating-point evaluations of the gsplat
+    formulas the bounds enclose. The real-number renderer and the package's own float64 evaluation are enclosed in both
+    cases.
 
-    Sources for the ``float32`` figures: CUDA C++ Programming Guide 12, "Mathematical Functions",
-    tables of maximum ulp errors, with ``--use_fast_math`` (division 2 ulp, ``sqrt.approx`` 1 ulp on
-    compute capability >= 5.2 and 3 ulp before, ``rsqrt`` 2 ulp, ``__expf(x)`` 2 + floor(|1.173 x|)
-    ulp, ``expf`` 2 ulp under PyTorch's default flags). One ulp is at most 2 units.
+    Sources for the ``float32`` figures: CUDA C++ Programming Guide 12, "Mathematical Functions", tables of maximum ulp
+    errors, with ``--use_fast_math`` (division 2 ulp, ``sqrt.approx`` 1 ulp on compute capability >= 5.2 and 3 ulp
+    before, ``rsqrt`` 2 ulp, ``__expf(x)`` 2 + floor(|1.173 x|) ulp, ``expf`` 2 ulp under PyTorch's default flags). One
+    ulp is at most 2 units.
     """
 
     name: Literal["float32", "real"]
@@ -417,10 +417,10 @@ def gamma(operations: int, unit: float = UNIT64) -> float:
 
 
 class Charges(NamedTuple):
-    """What splat bounds are charged for the bounded program's rounding, as kernels take it; made by `charges`.
+    """Error constants of the bounded program's rounding, by which splat kernels widen bounds; made by `charges`.
 
-    Each is relative to what the label of design.md that `charges` names beside it says, but for ``flush``, which
-    is absolute, and ``overflow``, a limit.
+    Each is relative to the quantity that the label of design.md named in `charges` states, but for ``flush``, which is
+    absolute, and ``overflow``, a limit.
     """
 
     flush: float
@@ -475,7 +475,7 @@ class Charges(NamedTuple):
 
 
 def charges(a: Arithmetic) -> Charges:
-    """Every charge of the splat kernels, with the count of roundings it covers (design.md, the label named)."""
+    """Return every error constant of the splat kernels, with its count of roundings and label of design.md."""
     return Charges(
         flush=a.flush, overflow=a.overflow, **_gaussian_charges(a), **_color_charges(a.unit), **_pixel_charges(a)
     )

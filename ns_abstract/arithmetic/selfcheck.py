@@ -118,5 +118,5 @@ def check_functions(functions: Mapping[str, Callable[[Float64Array, Float64Array
 
 @cache
 def platform_problems() -> tuple[str, ...]:
-    """What is wrong with this process' arithmetic, one sentence each; with any, nothing it computes is guaranteed."""
+    """Return one sentence for each fault of this process' arithmetic; with any fault, no result is guaranteed."""
     return tuple(check_functions())

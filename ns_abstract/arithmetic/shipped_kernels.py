@@ -30,7 +30,7 @@ def runs(level: str) -> bool:
 
 
 def shipped_folder(package: Path, key: str) -> Path | None:
-    """The kernels of the sources with hash ``key`` for the highest level that this processor has; None: there are none.
+    """Return the folder of kernels (``key``: hash of their sources) for this processor's highest level, or None.
 
     None, too, where NUMBA_CPU_NAME or NUMBA_CPU_FEATURES say what to compile for.
     """
@@ -41,7 +41,7 @@ def shipped_folder(package: Path, key: str) -> Path | None:
 
 
 def adopt(folder: Path, function: str, stamp: str) -> None:
-    """Put this processor in place of the level that a function's kernels in ``folder`` were compiled for.
+    """Rewrite a function's kernels in ``folder``: they name this processor in place of the level compiled for.
 
     Kernels of other sources than those of ``stamp`` are dropped.
     """

@@ -45,7 +45,7 @@ class TaylorBasis:
 
     @cached_property
     def products(self) -> dict[tuple[int, int], int | None]:
-        """Place of the product of two monomials, None above the degree."""
+        """Index of the product's monomial by the indices of two monomials; None: it lies above the degree."""
         places = {e: i for i, e in enumerate(self.exponents)}
         return {
             (i, j): places.get(tuple(map(sum, zip(a, b, strict=True))))
@@ -94,7 +94,7 @@ class TaylorArray:
         return np.abs(self.coefficients).sum(axis=0) * TAYLOR_UP
 
     def widened(self, radius: Float64Array | float) -> TaylorArray:
-        """The same with ``radius`` added."""
+        """The same models with ``radius`` added to their radii."""
         return TaylorArray(self.basis, self.coefficients, (self.radius + radius) * TAYLOR_UP)
 
     def _lift(self, other: TaylorArray | Float64Array | float) -> TaylorArray:

@@ -1,4 +1,4 @@
-"""Tools for compiled kernels."""
+"""numba intrinsics for compiled kernels: pointers, prefetching, atomic counters, bits."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ def borrowed(typingctx, array):  # pyright: ignore[reportRedeclaration]
 
 @intrinsic
 def prefetch(typingctx, array, row, byte):  # pyright: ignore[reportRedeclaration]
-    """Ask for the cache line of ``array[row]`` (or a `pointer`'s) that lies ``byte`` bytes in; changes nothing."""
+    """Prefetch the cache line at byte ``byte`` of ``array[row]`` (or of a `pointer`'s element); changes no value."""
     if not isinstance(array, types.Array | types.CPointer):
         raise TypeError(f"prefetch() takes an array or a pointer, not {array}")
 
@@ -89,7 +89,7 @@ def offset_by(typingctx, elements, count):  # pyright: ignore[reportRedeclaratio
 
 @intrinsic
 def taken(typingctx, counter):  # pyright: ignore[reportRedeclaration]
-    """What the int64 that the `pointer` leads to was before it grew by 1; no two threads get the same."""
+    """Add 1 atomically to the int64 at the `pointer`; return its value before, which no other thread gets."""
     if counter != types.CPointer(types.int64):
         raise TypeError(f"taken() takes the pointer to an int64 array, not {counter}")
 
@@ -111,7 +111,7 @@ def lowest_bit(typingctx, mask):  # pyright: ignore[reportRedeclaration]
 
 @intrinsic
 def signed(typingctx, bits):  # pyright: ignore[reportRedeclaration]
-    """64 bits as an int64."""
+    """Reinterpret 64 bits as an int64."""
     return types.int64(types.int64), lambda context, builder, signature, args: args[0]
 
 

@@ -27,7 +27,7 @@ LINE = 64
 
 
 class LanesType(types.Type):
-    """``width`` floats of the type ``element``."""
+    """numba's type of a vector of ``width`` floats of the type ``element``."""
 
     def __init__(self, width: int, element: types.Float = types.float64) -> None:
         self.width, self.element = width, element
@@ -35,7 +35,7 @@ class LanesType(types.Type):
 
 
 class MaskType(types.Type):
-    """``width`` truth values."""
+    """numba's type of a vector of ``width`` truth values."""
 
     def __init__(self, width: int) -> None:
         self.width = width
@@ -62,7 +62,7 @@ _KINDS = {
 
 
 def _width(*kinds: types.Type) -> int:
-    """Number of lanes of an operation on ``kinds``; 0: on floats alone."""
+    """Number of lanes of an operation on arguments of the types ``kinds``; 0: all are scalars."""
     widths = {kind.width for kind in kinds if isinstance(kind, LanesType | MaskType)}
     if len(widths) > 1:
         raise TypeError(f"lanes of different widths: {kinds}")
@@ -70,7 +70,7 @@ def _width(*kinds: types.Type) -> int:
 
 
 def _wide(builder, value, kind: types.Type, width: int):
-    """``value`` in all ``width`` lanes where it is a single one."""
+    """Return ``value`` itself, or copied to all ``width`` lanes if it is a scalar."""
     if width == 0 or isinstance(kind, LanesType | MaskType):
         return value
     vector = ir.VectorType(value.type, width)
@@ -79,19 +79,19 @@ def _wide(builder, value, kind: types.Type, width: int):
 
 
 def operands(builder, sig, args):
-    """The arguments of a call as values of one type, floats in all lanes."""
+    """Return the arguments of a call with scalars copied to all lanes, so that all have one type."""
     width = _width(*sig.args)
     return [_wide(builder, value, kind, width) for value, kind in zip(args, sig.args, strict=True)]
 
 
 def _typed(function: Callable, cases: list) -> None:
-    """Tell numba the signatures ``cases`` of ``function``."""
+    """Register the signatures ``cases`` of ``function`` with numba's type inference."""
     template = type(f"_Of{function.__name__}", (ConcreteTemplate,), {"cases": cases})
     infer_global(function)(template)  # pyright: ignore[reportOptionalCall]
 
 
 def _register(function: Callable, arguments: int, masks: bool, build: Callable) -> None:
-    """Let ``function`` take lanes, or lanes and floats; ``build(builder, *values)`` makes the result."""
+    """Make numba compile ``function`` for lanes (and floats); ``build(builder, *values)`` emits its LLVM code."""
     cases = []
     for lanes, mask in _KINDS.values():
         result = mask if masks else lanes
@@ -121,7 +121,7 @@ _register(operator.ne, 2, True, lambda builder, a, b: builder.fcmp_unordered("!=
 
 
 def by_intrinsic(name: str, builder, *values):
-    """LLVM's function ``name`` of floats or lanes, all of one type."""
+    """Call LLVM's intrinsic ``name`` on floats or lanes, all of one type."""
     kind = values[0].type
     suffix = f"v{kind.count}{_SUFFIXES[kind.element]}" if isinstance(kind, ir.VectorType) else _SUFFIXES[kind]
     function = ir.FunctionType(kind, [kind] * len(values))
@@ -203,7 +203,7 @@ def where(typingctx, mask, a, b):  # pyright: ignore[reportRedeclaration]
 
 @intrinsic
 def bits(typingctx, mask):  # pyright: ignore[reportRedeclaration]
-    """Bit k of an int64 tells whether lane k of ``mask`` holds."""
+    """Return an int64 whose bit k is 1 where lane k of ``mask`` holds."""
 
     def codegen(context, builder, sig, args):
         packed = builder.bitcast(args[0], ir.IntType(sig.args[0].width))
@@ -214,7 +214,7 @@ def bits(typingctx, mask):  # pyright: ignore[reportRedeclaration]
 
 @intrinsic
 def lane_sum(typingctx, a):  # pyright: ignore[reportRedeclaration]
-    """Sum of the lanes, in halves: rounded as often as there are halvings."""
+    """Sum of the lanes, added half to half: rounded as often as the lanes can be halved."""
 
     def codegen(context, builder, sig, args):
         value, width = args[0], sig.args[0].width
@@ -231,7 +231,7 @@ def lane_sum(typingctx, a):  # pyright: ignore[reportRedeclaration]
 
 @intrinsic
 def spans(typingctx, first, last):  # pyright: ignore[reportRedeclaration]
-    """Byte k of an int64 has the bits from ``ceil(first)`` to ``floor(last)`` of lane k; 8 lanes of -1 to 8."""
+    """Return an int64: in byte k the bits from ``ceil(first)`` to ``floor(last)`` of lane k; 8 lanes of -1 to 8."""
 
     def codegen(context, builder, sig, args):
         wide = ir.VectorType(ir.IntType(64), 8)
@@ -270,19 +270,19 @@ def _loader(elements, width: int):
 
 @intrinsic
 def load8(typingctx, elements, at):  # pyright: ignore[reportRedeclaration]
-    """``elements[at : at + 8]`` of a `compiled.pointer` as lanes."""
+    """``elements[at : at + 8]`` of an `intrinsics.pointer` as lanes."""
     return _loader(elements, 8)
 
 
 @intrinsic
 def load4(typingctx, elements, at):  # pyright: ignore[reportRedeclaration]
-    """``elements[at : at + 4]`` of a `compiled.pointer` as lanes."""
+    """``elements[at : at + 4]`` of an `intrinsics.pointer` as lanes."""
     return _loader(elements, 4)
 
 
 @intrinsic
 def load_line(typingctx, elements, at):  # pyright: ignore[reportRedeclaration]
-    """`LINE` bytes of a `compiled.pointer` to float64 or float32 from ``elements[at]`` on as lanes."""
+    """Load `LINE` bytes, float64 or float32 numbers from ``elements[at]`` of an `intrinsics.pointer` on, as lanes."""
     if not isinstance(elements, types.CPointer) or elements.dtype not in _FLOATS:
         raise TypeError(f"lanes are read through pointer(float64 or float32 array), not {elements}")
     return _loader(elements, 8 * LINE // elements.dtype.bitwidth)
@@ -290,7 +290,7 @@ def load_line(typingctx, elements, at):  # pyright: ignore[reportRedeclaration]
 
 @intrinsic
 def store(typingctx, elements, at, lanes):  # pyright: ignore[reportRedeclaration]
-    """Write the lanes to ``elements[at : ...]`` of a `compiled.pointer`."""
+    """Write the lanes to ``elements[at : ...]`` of an `intrinsics.pointer`."""
     _check(elements, lanes)
 
     def codegen(context, builder, sig, args):
@@ -322,7 +322,7 @@ def _transposed(builder, rows):
 
 @intrinsic
 def store_columns(typingctx, elements, at, stride, rows):  # pyright: ignore[reportRedeclaration]
-    """Write lane k of the eight ``rows`` side by side to ``elements[at + stride k : ...]`` of a `compiled.pointer`."""
+    """Write lane k of the eight ``rows`` side by side to ``elements[at + stride k : ...]`` of a pointer."""
     _check(elements, _KINDS[8][0])
 
     def codegen(context, builder, sig, args):

@@ -70,7 +70,7 @@ def store_rows(out, rows, at, line, sums):
 
 @njit(cache=True, error_model="numpy")
 def rows_from(first, last, width):
-    """Where `ROWS` rows of ``width`` begin, from the row ``first`` on; the row ``last`` fills up the rest."""
+    """Return the offsets of `ROWS` rows of ``width`` numbers from ``first`` on; row ``last`` fills up the rest."""
     return (
         first * width, min(first + 1, last) * width, min(first + 2, last) * width, min(first + 3, last) * width,
         min(first + 4, last) * width, min(first + 5, last) * width,

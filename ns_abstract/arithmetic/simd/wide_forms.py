@@ -1,6 +1,6 @@
 """Forms of eight quantities side by side: the rules of `forms` with sums kept in registers (design.md, A6).
 
-A form lies in a flat array of doubles (`compiled.pointer`), row after row as `forms` has them, eight lanes each; the
+A form lies in a flat array of doubles (`intrinsics.pointer`), row after row as `forms` has them, eight lanes each; the
 row ``sum |q|`` has no meaning where there are no terms of order 2. A rule takes the places where its operands and its
 result begin, and `size` tells how long a form is. Each function has the name of its kernel there; results may be
 written over no operand unless it says so.
@@ -38,7 +38,7 @@ def size(m):
 
 @njit(cache=True, error_model="numpy", forceinline=True)
 def _norms(w, a, m, order):
-    """The rows ``sum |g|`` and ``sum |q|``."""
+    """Write the rows ``sum |g|`` and ``sum |q|`` of the form at ``a`` (`forms.set_norms`)."""
     linear = load8(w, a + 8 * (m + 1))
     if order == 2:
         return linear, load8(w, a + 8 * (m + 2))
@@ -81,20 +81,20 @@ def scale_add(w, a, s, b, t, shift, out, m):
 
 @njit(cache=True, error_model="numpy", forceinline=True)
 def _nothing(like):
-    """Lanes of 0."""
+    """Return lanes of 0, of the type of ``like``."""
     return where(abs(like) >= 0.0, 0.0, 0.0)
 
 
 @njit(cache=True, error_model="numpy")
 def clear(w, out, m):
-    """Let the form be 0."""
+    """Set the form at ``out`` to 0."""
     for k in range(m + 3):
         store(w, out + 8 * k, _nothing(load8(w, out)))
 
 
 @njit(cache=True, error_model="numpy", forceinline=True)
 def _before(w, at, fresh):
-    """What a sum starts from."""
+    """Return the start of a sum: lanes of 0 if it is ``fresh``, else the eight numbers at ``at``."""
     return _nothing(load8(w, at)) if fresh else load8(w, at)
 
 
@@ -204,7 +204,7 @@ def _compose(w, a, f0, f1, f2_low, f2_high, out, m):
 
 @njit(cache=True, error_model="numpy", forceinline=True)
 def _ends(w, a, m):
-    """Lower and upper bounds of a positive quantity, and whether functions of it are evaluated there."""
+    """Lower and upper bounds of a form, and whether the lower one lies where functions are defined (`forms._ends`)."""
     c = load8(w, a)
     e = (load8(w, a + 8 * (m + 1)) + load8(w, a + 8 * m)) * UP
     low = (c - e) * (1.0 - FORM_ROUNDING)
@@ -261,7 +261,7 @@ def clamp(w, a, limit_low, limit_high, low, high, m):
 
 @njit(cache=True, error_model="numpy")
 def _raise(w, a, sign, floor, low, high, m):
-    """Replace ``sign * a`` by its maximum with ``floor``, given its bounds."""
+    """Replace the form ``sign * a`` by ``max(sign * a, floor)``, given bounds ``low``, ``high`` of ``sign * a``."""
     crosses = (low < floor) & (high > floor)
     under = (low < floor) & (high <= floor)
     # floor + s t, s = chord slope of max(t, 0) over t = a - floor in [low - floor, high - floor]
