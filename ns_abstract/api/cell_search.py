@@ -1,6 +1,6 @@
-"""One search for verdicts on cells, whatever is claimed of them: open, examine, split, store, report.
+"""The search for verdicts on cells, the same for every question: open, examine, split, store, report.
 
-A `CellQuestion` says what is claimed, with a margin that is positive where it holds; `CellSearch` does the rest.
+A `CellQuestion` states the claim, with a margin that is positive where it holds; `CellSearch` does the rest.
 """
 
 from __future__ import annotations
@@ -47,10 +47,10 @@ Examine = Callable[[int, CellGrid, tuple[Cell, ...]], BlockResult]
 
 @dataclass(frozen=True, kw_only=True)
 class SearchProgress:
-    """The time of a search, to which a question adds what it has found.
+    """Progress of a search: its time, to which subclasses add fractions of the set.
 
     Attributes:
-        elapsed: Seconds of this search; earlier ones that it goes on with are not counted.
+        elapsed: Seconds of this search; earlier ones that it continues are not counted.
         total_budget: Seconds that it may take.
     """
 
@@ -59,29 +59,29 @@ class SearchProgress:
 
 
 def shares_text(certified: float, falsified: float, unknown: float, not_examined: float) -> str:
-    """The four parts of a set's volume, which sum to 1, in words."""
+    """Return a sentence with the four fractions of a set's volume, which sum to 1."""
     parts = {"certified": certified, "falsified": falsified, "unknown": unknown, "not examined": not_examined}
     return ", ".join(f"{name} {percent(part)}" for name, part in parts.items())
 
 
 class Examiner(Protocol):
-    """What finds verdicts; opened once by every process that examines cells."""
+    """Bounds and attacks cells to find their verdicts; every process that examines cells opens one."""
 
     @property
     def fingerprint(self) -> Mapping[str, Any]:
-        """What a stored search must agree with to be continued."""
+        """Identity of scene, network and settings; a stored search with another fingerprint is not continued."""
         ...
 
     @property
     def recipe(self) -> Recipe[Any]:
-        """How another process opens it."""
+        """Recipe by which another process opens the same examiner."""
         ...
 
     def examine(self, number: int, grid: CellGrid, cells: tuple[Cell, ...]) -> BlockResult:
-        """What becomes of cells of the set with this number: verdicts, and smaller cells where there is none.
+        """Return verdicts on cells of the set with this number, and smaller cells in place of those without one.
 
         Depends on the cells alone. "certified" means a proved lower bound above 0 of the margin of every picture.
-        Raises WorkCancelledError where there is no time for it.
+        Raises WorkCancelledError if the time is over.
         """
         ...
 
@@ -128,56 +128,56 @@ class CellQuestion(ABC, Generic[P]):
         self.sets, self.fixed = dict(sets), fixed
 
     def grid(self, number: int) -> CellGrid:
-        """The cells of a set whose search begins: the set as one cell, if nothing else is known."""
+        """Return the grid of cells with which the search of a set begins; by default the set is one cell."""
         return CellGrid.adaptive(self.sets[number], [1] * self.sets[number].dimensions)
 
     def first_blocks(self, number: int, grid: CellGrid) -> list[list[Cell]]:
-        """What the search of a set begins with."""
+        """Return the blocks of cells that the search of a set examines first."""
         return [grid.roots()]
 
     def stored_set(self, number: int) -> ParameterBox | None:
-        """The set of a number that an earlier command asked about, or None."""
+        """Return the box of a set that the stored, earlier search had under this number, or None."""
         return None
 
     def counterexamples(self, number: int, grid: CellGrid, findings: Any) -> Iterator[tuple[str, dict[str, Any]]]:
-        """Names and arrays of the files that show why cells are falsified."""
+        """Yield file names and arrays of the counterexamples of a block's falsified cells."""
         return iter(())
 
     def check(self, request: Request) -> None:
-        """Refuse what cannot be done, before anything is written. Raises InputError that says what and why."""
+        """Raise InputError, before anything is written, if this question cannot do what ``request`` asks."""
 
     def reserved(self, seconds: float) -> float:
-        """Seconds of so many for search and report together that are kept for `after`."""
+        """Return how many of ``seconds``, for search and report together, are reserved for `after`."""
         return 0.0
 
     def opened(self, search: CellSearch[P]) -> None:
-        """Tell the store what its last report needs, before a signal can end the search."""
+        """Called once the store is open, before a signal can end the search: stores values for the last report."""
 
     def prepare(self, search: CellSearch[P], request: Request) -> None:
-        """What comes before the first cell is examined; a signal ends it at once."""
+        """Called before the first cell is examined, outside of the time budget; a signal ends it at once."""
         search.report("running")
         request.on_open(search.store)
 
     def before(self, search: CellSearch[P], deadline: Deadline) -> None:
-        """What comes first of the time that is given."""
+        """Called at the start of the time budget, before cells are examined."""
 
     def after(self, search: CellSearch[P], deadline: Deadline) -> None:
-        """What is made of the verdicts for the last report."""
+        """Called after the search, in the reserved time: computes more results from the verdicts."""
 
     def finish(self, search: CellSearch[P]) -> None:
-        """Prepare for the last report, also after a failure."""
+        """Called before the last report is written, also after a failure."""
 
     def varied_scenes(self) -> tuple[Sequence[VariationKind], Callable[[VariationKind], ProveCell]] | None:
-        """What may vary of the scene, and what bounds and attacks cells for all such scenes (V13); None: nothing."""
+        """Return kinds of variations of the scene, and a maker of cell provers under one (V13); None: unsupported."""
         return None
 
     def margin_rows(self, rows: dict[int, list[Row]]) -> tuple[dict[int, list[Row]], dict[str, Any]]:
-        """Those of the certified rows whose scene margin is looked for, and what report.json says besides."""
+        """Return the certified rows for which a scene margin is computed, and entries to add to report.json."""
         return rows, {}
 
     @abstractmethod
     def progress(self, store: Store) -> P:
-        """Where the search stands."""
+        """Return the progress, read from the store."""
 
     @abstractmethod
     def report(self, search: CellSearch[P], state: str) -> dict[str, Any]:
@@ -186,11 +186,11 @@ class CellQuestion(ABC, Generic[P]):
 
 @dataclass(frozen=True)
 class Request:
-    """How much is to be done, in ``budget`` seconds.
+    """What a search is to do in ``budget`` seconds.
 
-    ``scene_margin``: whether to look, in half of the time, for the largest variation of the scene for which what is
-    certified holds. ``rows``: whether the cells are read back at the end. ``on_open`` is called with the store before
-    the search, when there is a report.
+    ``scene_margin``: whether to use half of the time to find the largest variation of the scene under which every
+    certified cell stays certified. ``rows``: whether the cells are read back at the end. ``on_open`` is called with the
+    store before the search, when there is a report.
     """
 
     budget: float
@@ -208,8 +208,7 @@ class CellSearch(Generic[P]):
     """The search for verdicts on a question's cells.
 
     ``store`` is ``cells.sqlite``, from `open` on; ``last`` writes the report, also when the process is ended;
-    ``scene_margin`` is what report.json says of margins of the scene; from ``deadline`` on no more pictures are made
-    for the report.
+    ``scene_margin`` is the entry of report.json of that name; after ``deadline`` the report gets no more pictures.
     """
 
     question: CellQuestion[P]
@@ -227,7 +226,7 @@ class CellSearch(Generic[P]):
         self.store: Store
 
     def open(self, *, resume: bool) -> Store:
-        """The store, with the sets begun. Raises InputError where the folder cannot be used."""
+        """Open the store, with every set of the question begun in it. Raises InputError: an unusable folder."""
         question = self.question
         fingerprint = question.examiner.fingerprint
         self.store = store = question.store(
@@ -249,7 +248,7 @@ class CellSearch(Generic[P]):
         return store
 
     def box(self, number: int, row: Mapping[str, Any]) -> ParameterBox:
-        """A cell that was read back."""
+        """Return the parameter box of a cell's ``row`` of the store."""
         names, box = [name for name, _ in self.question.parameters], self.grids[number].box
         for axis, name in enumerate(box.names):
             column = names.index(name)
@@ -257,7 +256,7 @@ class CellSearch(Generic[P]):
         return box
 
     def report(self, state: str) -> dict[str, Any]:
-        """Bring the report up to date; returns the content of report.json."""
+        """Write the report anew; returns the content of report.json."""
         return self.question.report(self, state)
 
     def run(self, engine: Callable[[ExitStack], Engine], stop: StopRequest, request: Request) -> dict[str, Any]:
@@ -313,7 +312,7 @@ class CellSearch(Generic[P]):
                 self.last.interrupted()
 
     def tell_progress(self) -> None:
-        """Tell who asked where the search stands."""
+        """Call ``on_progress`` with the question's progress."""
         point: Any = self.question.progress(self.store)
         if isinstance(point, SearchProgress):
             budget = self.request.budget
@@ -340,14 +339,14 @@ class CellSearch(Generic[P]):
         store.trace()
 
     def _keep_counterexamples(self, block: CellBlock, findings: BlockResult) -> None:
-        """Store what breaks the claim before the cells are said to be falsified."""
+        """Write the counterexamples' files of a block, before its cells are stored as falsified."""
         for name, arrays in self.question.counterexamples(block.frame, self.grids[block.frame], findings):
             buffer = io.BytesIO()
             np.savez(buffer, **arrays)
             self.store.keep_image(name, buffer.getvalue())
 
     def _margins(self, deadline: Deadline) -> None:
-        """How far the scene may vary before what is certified is lost."""
+        """Compute the scene margin: the largest variation of each kind under which certified cells stay so."""
         question, store = self.question, self.store
         varied = question.varied_scenes()
         if varied is None:
@@ -364,7 +363,7 @@ class CellSearch(Generic[P]):
 
 
 def result_cells(rows: Mapping[int, list[Row]], make: Callable[..., C], *columns: str) -> tuple[C, ...]:
-    """Cells of a result.
+    """Return the cells of a result, made by ``make`` from rows of the store.
 
     Args:
         make: Takes the number, the ends of the box, the verdict, ``columns`` of the row and its counterexample or None.
@@ -384,14 +383,14 @@ def result_cells(rows: Mapping[int, list[Row]], make: Callable[..., C], *columns
 
 
 def cell_place(cell: Cell, otherwise: str) -> str:
-    """A part of a file's name that tells a cell from all others of its set."""
+    """Return a part of a file's name that identifies a cell among those of its set."""
     return "_".join(f"{a}-{b}" for a, b in zip(cell.first, cell.past, strict=True)) or otherwise
 
 
 def periodic_report(
     store: Store, on_progress: Callable[[], object], report: Callable[[], object] = lambda: None
 ) -> Callable[[float], None]:
-    """Return what a search does between results: often a point of the trace and ``on_progress``, rarely ``report``."""
+    """Return a function to call between results: it often calls ``on_progress``, and rarely ``report``."""
     traced = reported = time.perf_counter()
 
     def tick(instant: float) -> None:

@@ -59,7 +59,7 @@ class CertificateReport:
         self.cameras: CameraDrawings | None = None
 
     def document(self, store: Store, state: str) -> tuple[dict[str, Any], dict[int, list[dict[str, Any]]]]:
-        """Content of report.json, and the cells by frame."""
+        """Return the content of report.json, and the cells' rows by frame."""
         rows = {tally.frame: store.leaves(tally.frame) for tally in store.tallies()}
         entries = [self._entry(tally, rows[tally.frame]) for tally in store.tallies()]
         sets = {frame: self.job.job.pose_sets[frame] for frame in rows}
@@ -79,7 +79,7 @@ class CertificateReport:
         return document, rows
 
     def write(self, state: str, *, pictures: bool = True) -> dict[str, Any]:
-        """Write both files, with new pictures or those there are; returns the content of report.json."""
+        """Write report.json and report.html, with new or earlier pictures; returns the content of report.json."""
         search = self.search
         document, rows = self.document(search.store, state)
         # kernels may have to be compiled for others
@@ -101,7 +101,7 @@ class CertificateReport:
 
     @cached_property
     def _standing(self) -> tuple[np.ndarray, np.ndarray]:
-        """Where cameras may stand; the same for every report, so that the scene is drawn once."""
+        """Ends of a box of possible camera positions; the same for every report, so that the scene is drawn once."""
         return standing(self._sets)
 
     @cached_property
@@ -166,7 +166,7 @@ class CertificateReport:
         }
 
     def _pictures(self, rows: Mapping[int, list[dict[str, Any]]]) -> list[dict[str, Any]]:
-        """A sample, the certified image with the smallest margin, and counterexamples."""
+        """Return the page's pictures: a sample, the certified image with the smallest margin, and counterexamples."""
         names = [name for name, _ in self.job.job.parameters]
         wanted: list[tuple[str, str, int, list[float]]] = []
         first = min(rows)
@@ -200,7 +200,7 @@ class CertificateReport:
         return preview(pictures.shown(image, pose), side)
 
     def _cell_pictures(self, rows: Mapping[int, list[dict[str, Any]]]) -> dict[tuple[int, int], dict[str, Any]]:
-        """By frame and position, a picture of some cells: the same number of each verdict, evenly spread."""
+        """Return pictures of some cells by frame and position: equally many of each verdict, evenly spread."""
         kinds = {
             kind: [(frame, k) for frame, cells in rows.items() for k, row in enumerate(cells) if row["verdict"] == kind]
             for kind in ("certified", "falsified", "unknown")
@@ -244,7 +244,7 @@ def _worst(rows: list[dict[str, Any]]) -> list[dict[str, Any]]:
 
 
 class PoseRenderer:
-    """Renders poses and shows them to the network."""
+    """Renders poses and evaluates the network on the pictures."""
 
     def __init__(self, job: Certification, cached: Callable[[int, np.ndarray], np.ndarray | None]) -> None:
         self.job, self._kept = job, cached
@@ -263,7 +263,7 @@ class PoseRenderer:
         return pictures, pose, pictures.image(pose) if image is None else image
 
     def look(self, title: str, frame: int, values: Sequence[float]) -> PoseImage:
-        """The picture at values of all parameters, the network's outputs and the margin.
+        """Return the picture at ``values`` of all parameters, with the network's outputs and the margin.
 
         Raises:
             WorkCancelledError: There is no time for it.
@@ -279,7 +279,7 @@ class PoseRenderer:
         return PoseImage(title, values, png, outputs[0].tolist(), margin if np.isfinite(margin) else None)
 
     def right(self, region: FailureRegion, rows: CellRows, parameters: Sequence[Mapping[str, Any]]) -> PoseImage | None:
-        """The nearest certified pose; where none is, the middle of a near cell at which the network is right."""
+        """Return the nearest certified pose; without one, the middle of a nearby cell where the network is right."""
         cells = rows[region.frame]
         for _, pose in broken.nearest(cells, "certified", region.pose, parameters):
             return self.look("nearest certified pose", region.frame, pose)

@@ -69,7 +69,7 @@ AnyQuestion = Question | PictureQuestion
 
 
 def question_of(model: Path | None, source: PropertySource) -> AnyQuestion:
-    """Return the question that a property and its network, if there is one, make.
+    """Return the question of a property, about a network's outputs or about the picture.
 
     Raises:
         InputError: A file or a field cannot be used, or the property needs a network, or has none.
@@ -141,7 +141,7 @@ class Certification:
 
     @property
     def scenes(self) -> tuple[str, ...]:
-        """That the set holds scenes besides poses, if it does."""
+        """Sentence that the set contains variations of the scene, if it does."""
         if not any(poses.perturbation.scene for poses in self.job.pose_sets):
             return ()
         return (
@@ -174,14 +174,14 @@ class Certification:
         }
 
     def pictures(self, index: int) -> FramePictures:
-        """Frame ``index``, ready to be rendered and bounded."""
+        """Return the pictures of frame ``index``, ready to be rendered and bounded."""
         return self.question.pictures(self.job.method, self.job.pose_sets[index], self.picture)
 
     def claim(self, pictures: FramePictures, poses: PoseBox | None = None) -> Claim:
-        """What is to hold in a frame.
+        """Return the property's claim on a frame.
 
-        ``poses``: the frame's set, if its parameters are counted otherwise than the pictures have them. Raises
-        InputError where the property makes no sense there.
+        ``poses``: the frame's set, if the pictures use sheared parameters. Raises InputError if the property does not
+        fit the frame.
         """
 
         def nominal() -> np.ndarray:
@@ -190,7 +190,7 @@ class Certification:
         return self.property.bind(pictures.pose_set if poses is None else poses, nominal)
 
     def grid(self, index: int) -> CellGrid:
-        """The cells of a frame whose search begins.
+        """Return the grid of cells with which a frame's search begins.
 
         Raises:
             InputError: The partition that was asked for does not fit the parameters.
@@ -212,7 +212,7 @@ class Certification:
         return max(1, min(BLOCK, _BLOCK_NUMBERS // self.question.numbers))
 
     def first_blocks(self, grid: CellGrid) -> list[list[Cell]]:
-        """What a frame's search begins with."""
+        """Return the blocks of cells that a frame's search examines first."""
         roots = grid.roots()
         ends = [0, *itertools.accumulate(size for size in _FIRST_BLOCKS if size < self.block)]
         ends += range(ends[-1] + self.block, len(roots) + self.block, self.block)
@@ -233,7 +233,7 @@ class Certification:
         return self.search(number, grid).examine(cells)
 
     def _cover(self, pictures: FramePictures, response: CameraResponse | None = None) -> SubBoxProof | None:
-        """What proves a frame's cells part by part; None with one parameter, and where rays cost more than networks."""
+        """Return the prover of a frame's cells by sub-boxes; None: one parameter, or rays cost more than networks."""
         model = self.model
         if not isinstance(model, NetworkModel) or pictures.box.dimensions < 2 or pictures.frame.tilewise:
             return None
@@ -252,22 +252,19 @@ class Certification:
         )
 
     def places(self, kind: VariationKind) -> bool:
-        """Whether a kind's parameters can be bounded beside those of every set."""
+        """Whether the parameters of a kind of variation can be bounded together with those of every set."""
         room = all(poses.box.dimensions + len(kind.place) <= MAX_DIMENSIONS for poses in self.job.pose_sets)
         return isinstance(self.model, NetworkModel) and room
 
     @property
     def kinds(self) -> tuple[VariationKind, ...]:
-        """What may vary of a scene while the property holds: of a property of the picture, the Gaussians alone."""
+        """Kinds of variations for the scene margin; for a property of the picture those of Gaussians alone."""
         return bounded_kinds(self.places) if isinstance(self.model, NetworkModel) else KINDS
 
     def _varied(
         self, kind: VariationKind, radius: float, frame: int
     ) -> tuple[FramePictures, SearchedScene, SearchedModel, SubBoxProof | None]:
-        """Pictures of a frame for all that may vary, as the search sees them, and the network behind them (V13).
-
-        The last is what proves cells part by part.
-        """
+        """Return a frame's pictures under a variation, the searched scene and network, and the sub-box prover (V13)."""
         method, poses, model = self.job.method, self.job.pose_sets[frame], self.model
         if kind.place:
             assert isinstance(model, NetworkModel)
@@ -282,7 +279,7 @@ class Certification:
         return pictures, pictures, model, self._cover(pictures, response)
 
     def prover(self, kind: VariationKind) -> ProveCell:
-        """Bounds and attacks cells for all scenes around the stored one (V13)."""
+        """Return a function that bounds and attacks cells for all scenes around the stored one (V13)."""
 
         # radii come one after the other; what is claimed does not depend on the scenes
         @lru_cache(1)
@@ -315,11 +312,7 @@ class Certification:
         return prove
 
     def foresee(self, index: int, seconds: float) -> None:
-        """Refuse a frame of which not even the first part can be bounded, where pictures are made ray by ray.
-
-        Raises:
-            InputError: What it would take.
-        """
+        """Raise InputError, with the time needed, if ``seconds`` are too few for the first part of a frame of rays."""
         if not self.job.rays:
             return
         pictures = cast("FramePictures", self.search(index, self.grid(index)).scene)
@@ -377,7 +370,7 @@ class Certification:
 
 @dataclass(frozen=True)
 class CertifySettings:
-    """What to certify, as the command line says it.
+    """Options of the command line that state what to certify.
 
     ``model``: network, .onnx; None: the property is one of the picture. ``network_arithmetic``: "float32" or "real".
     ``picture``: whether the network is shown floats or pictures of 8 bits. ``memory``: bytes for the bounds of one

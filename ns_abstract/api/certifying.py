@@ -57,19 +57,19 @@ def network_memory(limit: float | None, workers: int) -> int:
 
 
 def check_network_memory(certification: Certification, limit: float | None, workers: int) -> None:
-    """Refuse a network one cell of which takes, about, more memory than a process may. Raises InputError: how much."""
+    """Raise InputError, with the size, if a network's cell takes, by an estimate, too much memory of a process."""
     job = certification.job
     certification.question.check_memory(len(job.parameters), allowed_memory(limit) / (1 if job.rays else workers))
 
 
 @dataclass(frozen=True)
 class CertifyProgress(SearchProgress):
-    """Where a search stands: mean fractions over the frames, and seconds.
+    """Progress of a search for certificates: mean fractions over the frames, and seconds.
 
     Attributes:
         certified, falsified, unknown: Fractions of the parameter volume that have this verdict.
         open: The rest, which is still to be examined; the result counts it as unknown.
-        seconds: Time spent, earlier searches that this one goes on with included.
+        seconds: Time spent, with that of the earlier searches that this one continues.
     """
 
     certified: float
@@ -89,7 +89,7 @@ class CertifyProgress(SearchProgress):
 
 
 class CertificateQuestion(CellQuestion[CertifyProgress]):
-    """What a network does on every picture of some frames' sets, and the report on it."""
+    """The claim that a property holds on every picture of some frames' sets, and the report on it."""
 
     def __init__(
         self, job: Certification, frames: Sequence[int], settings: Mapping[str, Any], command: tuple[str, ...]
@@ -104,7 +104,7 @@ class CertificateQuestion(CellQuestion[CertifyProgress]):
         self._report: CertificateReport | None = None
 
     def reports(self, search: CellSearch[Any]) -> CertificateReport:
-        """The report on a search."""
+        """Return the writer of the search's report."""
         if self._report is None or self._report.search is not search:
             self._report = CertificateReport(self.job, self.about, search)
         return self._report

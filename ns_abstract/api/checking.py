@@ -25,15 +25,15 @@ _MOST_CLAIMS = 1_000_000
 
 @dataclass
 class Audit:
-    """What came of the claims.
+    """The outcome of an audit: numbers of claims that were proved, refuted and not settled.
 
     Attributes:
-        claims: Number of claims that were looked at.
+        claims: Number of claims that were examined.
         proved, refuted, unsettled: Their numbers by outcome.
-        float32: Number of those proved of every float32 evaluation; the others concern the picture in real numbers.
-        refutations: By refuted claim: frame, cell, pose, what is wrong.
-        uniform: Claims and proofs of the uniform sample, and the least part of all claims that holds, at 95 %.
-        structure: What is wrong with the cells; empty: they tile every set, every pixel is bounded, counts are right.
+        float32: Number of those proved for every float32 evaluation; the others concern the picture in real numbers.
+        refutations: For each refuted claim: frame, cell, pose, what is wrong.
+        uniform: Claims and proofs of the uniform sample, and the least fraction of all claims that holds, at 95 %.
+        structure: Faults of the cells; empty: they tile every set, every pixel is bounded, counts are right.
         seconds, median_seconds: Of all claims, and of one that was settled.
         picture: What all proved claims hold of: "real numbers", or "every float32 evaluation".
         unclaimed: Numbers of frames of which nothing is claimed: they are missing, or their cells do not cover the set.

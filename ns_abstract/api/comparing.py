@@ -153,7 +153,7 @@ class ComparisonJob(Job):
 
     @property
     def background_choice(self) -> Assumption | None:
-        """B's background where it is A's, as B's file states none."""
+        """Assumption that B has A's background, if B's file states none; else None."""
         return next((entry for entry in self.other._scene_choices if entry.origin == _BACKGROUND_OF_A), None)
 
     @property
@@ -181,7 +181,7 @@ def _named(other: Scene) -> Iterator[None]:
 
 
 def _check_comparable(scene: Scene, other: Scene, pose_sets: Sequence[PoseBox]) -> None:
-    """Refuse what cannot be compared. Raises InputError that says which, and what to do."""
+    """Raise InputError, with the fix, if the two scenes or the sets cannot be compared."""
     if scene.rays != other.rays:
         raise InputError(
             "a NeRF and a splat scene have no common bounds",
@@ -340,7 +340,7 @@ def compare(
 
 
 def check_comparison(tolerance: float | None, target_ratio: float, budget: float | None, prefix: str = "--") -> None:
-    """Refuse numbers that cannot be used. Raises InputError: one of them; options are named with ``prefix``."""
+    """Raise InputError if a number is out of range; options are named with ``prefix``."""
 
     def name(word: str) -> str:
         return f"--{word}".replace("_", "-") if prefix else word

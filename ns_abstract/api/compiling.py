@@ -32,7 +32,7 @@ _log = logging.getLogger("ns_abstract.kernels")
 
 
 def shares(stages: Sequence[str], count: int) -> list[list[str]]:
-    """Stages, the slowest first, in at most ``count`` parts: the first ones alone, the rest together."""
+    """Return at most ``count`` groups of stages, given slowest first: the first ones alone, the rest together."""
     count = max(1, min(count, len(stages)))
     return [[stage] for stage in stages[: count - 1]] + [list(stages[count - 1 :])]
 
@@ -111,7 +111,7 @@ def _latest(line: Connection, before: int) -> int:
 
 
 def _watch(line: Connection) -> None:
-    """Say how many kernels are done; end this process with the one that started it."""
+    """Send the number of compiled kernels over ``line``; end this process when its parent has ended."""
     while True:
         time.sleep(1.0)
         try:

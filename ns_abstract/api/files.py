@@ -21,7 +21,7 @@ from ns_abstract.perturbation.specification import Perturbation, load_perturbati
 
 @dataclass(frozen=True)
 class Settings:
-    """The options of a command line that say what to bound.
+    """The options of a command line that select the scene, the cameras and the sets to bound.
 
     Attributes:
         perturbation_filename: Perturbation JSON; None: the camera path holds it.
@@ -61,7 +61,7 @@ class Settings:
         }
 
     def _set_choices(self, pose_sets: Sequence[PoseBox], path: CameraPath) -> tuple[Assumption, ...]:
-        """Where the size of the pictures and their sets come from."""
+        """Return the assumptions on the pictures' size and the sets, with their origins."""
         file, factor, name = self.perturbation_filename, self.downscale_factor, Path(path.source).name
         if self.given_set is not None:
             varied = "options"

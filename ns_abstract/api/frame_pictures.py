@@ -40,7 +40,7 @@ class PropertySource:
 
     @classmethod
     def of(cls, given: Mapping[str, Any] | str | Path) -> PropertySource:
-        """Of a mapping, or read from a file. Raises InputError where the file cannot be read."""
+        """Return the source of a property given as a mapping or a file. Raises InputError: an unreadable file."""
         if isinstance(given, Mapping):
             return cls(dict(given))
         return cls(load_json(Path(given), "property file"), Path(given))
@@ -72,15 +72,15 @@ class PropertySource:
 
     @property
     def folder(self) -> Path:
-        """Where files that it names lie."""
+        """Folder to which file names in the property are relative."""
         return Path() if self.file is None else self.file.parent
 
     def absolute(self) -> PropertySource:
-        """The same for a process with another working directory."""
+        """The same source with an absolute path, for a process with another working directory."""
         return PropertySource(self.value, (self.file or Path("property")).absolute())
 
     def within(self, error: InputError) -> InputError:
-        """The error with the file named."""
+        """Return ``error`` with the property's file named in it."""
         return error if self.file is None else error.within(self.file)
 
 
@@ -140,7 +140,7 @@ class FramePictures(ScenePictures):
         return renderer
 
     def differentiable(self, values: torch.Tensor) -> torch.Tensor:
-        """The floats before any rounding, which has no slope."""
+        """Return the float picture without rounding to 8 bits, so that it has a gradient."""
         return self._differentiable(values)
 
     @property

@@ -107,7 +107,7 @@ class Job:
 
     @property
     def recipe(self) -> Recipe[Job]:
-        """How another process opens this job; files are looked for under the same paths."""
+        """Recipe by which another process opens this job, from files under the same paths."""
         again = partial(
             built, Job, (self.source.absolute.open,), self.pose_sets, arithmetic=self.arithmetic, seed=self.seed,
             memory_limit=self.memory_limit, layers=self.layers,
@@ -116,7 +116,7 @@ class Job:
 
     @property
     def continues(self) -> bool:
-        """Whether what is known of a frame saves work on it; others are covered anew as a whole."""
+        """Whether stored bounds of a frame are continued; otherwise its whole set is bounded anew."""
         return self.rays
 
     @property
@@ -145,7 +145,7 @@ class Job:
         return self.method.memory(pixels, max(1, most_threads() // processes))
 
     def varied(self, index: int, extra: SceneVariation) -> PoseBox:
-        """The set of frame ``index`` with more scenes in it."""
+        """Return the set of frame ``index`` with the variation ``extra`` of the scene added."""
         poses = self.pose_sets[index]
         return replace(poses, perturbation=replace(poses.perturbation, scene=(*poses.perturbation.scene, extra)))
 
@@ -265,7 +265,7 @@ class Job:
 
     @property
     def plan(self) -> tuple[str, ...]:
-        """What is left out for this scene, whatever the frame."""
+        """Sentences on computations that are left out for this scene, in every frame."""
         return self.method.plan
 
     @property
@@ -275,7 +275,7 @@ class Job:
 
     @property
     def fingerprint(self) -> dict[str, Any]:
-        """What a stored result must agree with to be continued."""
+        """Identity of scene, program and sets; a stored result with another one is not continued."""
         return self._fingerprint
 
     @cached_property

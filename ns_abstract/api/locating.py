@@ -59,7 +59,7 @@ class LocateProgress(SearchProgress):
 
     @property
     def sentence(self) -> str:
-        """What is left, and how well the best pose explains the photo."""
+        """Return a sentence: possible volume, and how well the best pose explains the photo."""
         best = "" if self.outliers is None else f", best pose misses {self.outliers:,} pixels"
         return f"at most {percent(self.left)} of the set left{best}"
 

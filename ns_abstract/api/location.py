@@ -59,7 +59,7 @@ class PhotoOptions:
 
     @property
     def brightness(self) -> Brightness:
-        """What the camera may do to the picture."""
+        """Gain and offset that the camera may apply to the picture."""
         return Brightness(self.gain, self.offset)
 
     def __post_init__(self) -> None:
@@ -118,7 +118,7 @@ class Location:
         self._searches: dict[int, LocationSearch] = {}
 
     def search(self, number: int) -> LocationSearch:
-        """The search of a frame's set; kept at hand."""
+        """Return the search of a frame's set, which is cached."""
         if number not in self._searches:
             self._searches.clear()
             frame, plain = self.job.frame(number, sheared=True), self.job.frame(number)
@@ -134,7 +134,7 @@ class Location:
         return assemble(plain.render(np.asarray(values, np.float64)), plain.camera)[..., :3]
 
     def possible_volume(self, number: int, cells: list[Cell]) -> float:
-        """The part of a set that ``cells`` of its search hold, at most."""
+        """Return an upper bound of the fraction of a set's volume in ``cells`` of its search."""
         search = self.search(number)
         plain, boxes = search.plain.box, list(map(search.grid.box_of, cells))
         whole = float(np.prod(np.subtract(plain.upper, plain.lower)))
@@ -211,7 +211,7 @@ def open_location(settings: LocateSettings) -> Location:
 
 
 def calibrated(scene: Scene, job: Job, options: PhotoOptions) -> tuple[PhotoOptions, Calibration]:
-    """What explains the run's training photos, but no less than ``options``. Raises InputError without photos."""
+    """Return options whose noise and outliers (at least those given) explain the training photos."""
     calibration = calibrate(
         scene, job.pose_sets[0].camera.height, noise=options.noise, outliers=options.outliers, arithmetic=job.arithmetic
     )

@@ -73,7 +73,7 @@ class LoopJob:
             )
 
     def reacher(self, dependence: Dependence = "kept") -> TubeBuilder:
-        """Computes tubes of the loop."""
+        """Return a builder of the loop's tubes (boxes of all states by step), with this ``dependence``."""
         view = ScenePictures(self.job.method.frame(self.job.pose_sets[0]))
         return TubeBuilder(self.loop, view, ControlBounds(self.model, self.loop.control), dependence, views=self._seen)
 
@@ -106,7 +106,7 @@ class LoopJob:
         return set(TRANSLATIONS) <= set(self.loop.camera.names)
 
     def places(self, kind: VariationKind) -> bool:
-        """Whether the scene's place can be bounded beside the pose: within it, or as more parameters."""
+        """Whether motions of the scene (``kind``) can be bounded: as part of the pose, or as more parameters."""
         fits = len(self.loop.camera.names) + len(kind.place) <= MAX_DIMENSIONS
         return fits or (kind is REGISTRATION and self._moves)
 

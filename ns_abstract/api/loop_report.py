@@ -63,13 +63,13 @@ class LoopReport:
         self._outside = None if elements is None else SceneDrawing(elements)
 
     def add_example(self, question: Question, run: SimulatedRun) -> None:
-        """Take a run that goes wrong, if there are not enough of them."""
+        """Add a failing run to the report's examples, up to their limit."""
         if len(self.examples) < _EXAMPLES:
             margin = run.margin(self.job.loop, question)
             self.examples.append({"question": question, "margin": margin, "states": run.states})
 
     def simulate_runs(self, deadline: Deadline) -> None:
-        """Random runs, the same ones every time."""
+        """Simulate random runs from a fixed seed, for the report."""
         loop, reacher = self.job.loop, self.job.search.reacher
         for number in range(_RUNS):
             generator = np.random.default_rng([17, number])
@@ -193,7 +193,7 @@ class LoopReport:
 
 
 def verdict(entries: Mapping[str, Mapping[str, Any]]) -> str:
-    """Of the whole initial box: falsified, reaches, safe or unknown."""
+    """Return the verdict on the whole initial box: falsified, reaches, safe or unknown."""
     if any(entry["cells"]["falsified"] for entry in entries.values()):
         return "falsified"
     done = [name for name, entry in entries.items() if entry["unknown"] == 0.0 and entry["cells"]["certified"]]

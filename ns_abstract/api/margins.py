@@ -45,7 +45,7 @@ class Margins:
         self.found: list[SceneMargin] = []
 
     def find(self, deadline: Deadline, kinds: Sequence[VariationKind]) -> None:
-        """Look for them; every kind has the same part of the time that is left then."""
+        """Find the margins; the remaining time is divided equally among the remaining kinds."""
         for number, kind in enumerate(kinds if self.cells else ()):
             part = deadline.within(deadline.left / (len(kinds) - number))
             self.found.append(largest_radius(kind, self.cells, self._remembered(kind), part))
@@ -65,7 +65,7 @@ class Margins:
         return remembered
 
     def keep(self) -> None:
-        """Store the scenes that break what is certified."""
+        """Write the files of scenes that falsify a certified cell."""
         for margin in self.found:
             if margin.example is not None:
                 buffer = io.BytesIO()
@@ -75,7 +75,7 @@ class Margins:
 
     @property
     def entry(self) -> dict[str, Any]:
-        """What report.json holds."""
+        """Return the entry `scene_margin` of report.json."""
         skipped = None if self.cells else "nothing is certified"
         return {"skipped": skipped, "kinds": [margin.entry for margin in self.found]}
 

@@ -211,7 +211,7 @@ class NearbyPictures:
         return image
 
     def scene_samples(self, seed: int) -> Iterator[SceneSample]:
-        """There are no other scenes."""
+        """Yield nothing: the scene does not vary."""
         return self._pictures.scene_samples(seed)
 
     def differentiable(self, values: torch.Tensor) -> torch.Tensor:

@@ -50,7 +50,7 @@ class Question:
         self.size = self.property.preprocess.size(self.network.input_shape)
 
     def drawn(self, poses: PoseBox) -> PoseBox:
-        """A set whose pictures have the size that the property asks for."""
+        """Return the set with pictures of the size that the property asks for."""
         return poses if self.property.preprocess.resize is None else resized(poses, *self.size)
 
     def opened(self, job: Job) -> None:
@@ -95,7 +95,7 @@ class Question:
         return sum(math.prod(self.network.shape(k)) for k in range(len(self.network.nodes) + 1))
 
     def guarantee(self, arithmetic: NetworkArithmetic) -> tuple[str, ...]:
-        """What holds of the network, one sentence each."""
+        """Sentences on the evaluations of the network that the certificate covers."""
         return self.network.guarantee(arithmetic)
 
     def check_memory(self, dimensions: int, memory: float) -> None:
@@ -112,7 +112,7 @@ class Question:
         return {**self.network.stamp, **shapes}
 
     def fingerprint(self, arithmetic: NetworkArithmetic) -> dict[str, Any]:
-        """What a stored search must agree with beside the property."""
+        """Identity of the network; a stored search with another one is not continued."""
         return {**network_prints("model", self.network), "network_arithmetic": arithmetic}
 
     def choices(self, arithmetic: NetworkArithmetic, picture: Picture) -> tuple[Assumption, ...]:
