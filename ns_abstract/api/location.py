@@ -211,7 +211,7 @@ def open_location(settings: LocateSettings) -> Location:
 
 
 def calibrated(scene: Scene, job: Job, options: PhotoOptions) -> tuple[PhotoOptions, Calibration]:
-    """Return options whose noise and outliers (at least those given) explain the training photos."""
+    """Return options with noise and outliers, at least those given, that explain photos. Raises InputError: none."""
     calibration = calibrate(
         scene, job.pose_sets[0].camera.height, noise=options.noise, outliers=options.outliers, arithmetic=job.arithmetic
     )

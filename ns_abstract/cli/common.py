@@ -114,14 +114,14 @@ def command(program: str, kind: Any, parts: Mapping[str, Any] | None = None, abo
 
 
 class _ToStderr(logging.Handler):
-    """Lines on what is stderr at the time."""
+    """Logging handler that writes to the present `sys.stderr`."""
 
     def emit(self, record: logging.LogRecord) -> None:
         print(self.format(record), file=sys.stderr, flush=True)
 
 
 def show_log() -> None:
-    """Print what the package has to say, a line each, to stderr."""
+    """Print the package's log messages to stderr, one line each."""
     log = logging.getLogger("ns_abstract")
     if not log.handlers:
         handler = _ToStderr()
@@ -151,7 +151,7 @@ def parse(read: Callable[[], Any]) -> Any:
 
 
 def complaint(text: str) -> str:
-    """The point of an error box that tyro prints, as one line."""
+    """Return the message of an error box that tyro prints, as one line."""
     # on a terminal there are colours, elsewhere the box may have no lines
     lines = re.sub(r"\x1b\[[0-9;]*m", "", text).splitlines()
     sections: list[list[str]] = [[]]
@@ -291,7 +291,7 @@ def _is(word: str, kind: type) -> bool:
 
 
 def _value(detail: str) -> tuple[str, str] | None:
-    """What stands in place of numbers, and the fix, from tyro's text on a value that cannot be parsed."""
+    """Return the unusable word and the fix, from tyro's text on a value that cannot be parsed as numbers."""
     quoted = re.search(r"(?:from|float:|base 10:|arguments:) (\[.*\]|'.*')", detail)
     words = re.findall(r"'([^']*)'", quoted[1]) if quoted else []
     expected = detail.split(" could be", maxsplit=1)[0]
@@ -310,7 +310,7 @@ def _value(detail: str) -> tuple[str, str] | None:
 
 
 def mistake(text: str) -> InputError:
-    """The error of a complaint, in this project's words where it is one of the usual ones."""
+    """Return tyro's complaint as an InputError, reworded if it is a frequent one."""
     field, problem, fix = None, text, None
     if (match := re.match(r"Error parsing (--[\w.-]+): (.*)", text)) and (value := _value(match[2])):
         field, (problem, fix) = match[1], value

@@ -78,7 +78,7 @@ def _value(hint: Any, flags: bool = True) -> str:
 
 
 def _default(field: dataclasses.Field[Any], given: Any, text: str) -> str:
-    """What is taken where an option is missing, if its text does not say so."""
+    """Return the default of an option as text, unless the option's own text has it."""
     value = field.default if given is None else getattr(given, field.name)
     if given is None and field.default_factory is not dataclasses.MISSING:
         value = field.default_factory()

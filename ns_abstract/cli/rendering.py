@@ -164,7 +164,7 @@ def _bounded(
 
 
 def _say_what_next(console: Console, report: Report, pending: Sequence[int]) -> None:
-    """Name the frames that could be tighter, or the way to go on where there was ``pending`` nothing."""
+    """Print which frames ended before the target, or, if none was ``pending``, that all had reached it."""
     if partial := sorted(set(report.pending) - set(report.missing)):
         console.print(f"{frames_listed(partial)} ended before the target: go on with --resume")
     elif not pending:
@@ -172,7 +172,7 @@ def _say_what_next(console: Console, report: Report, pending: Sequence[int]) -> 
 
 
 def _run_record(job: Job, options: Render | Compare, frames: tuple[int, ...], problems: tuple[str, ...]) -> RunRecord:
-    """What the report says about the command; ``problems`` of the platform take the guarantee away."""
+    """Return the report's record of the command; ``problems`` of the platform make the guarantee "sampled"."""
     camera = job.pose_sets[0].camera
     return RunRecord(
         guarantee="sampled" if problems else job.method.guarantee,

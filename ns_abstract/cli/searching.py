@@ -83,12 +83,12 @@ def searched(
 
 
 def kept_cells(store: Store) -> str:
-    """What a search that goes on has and lacks, in words."""
+    """Return a sentence on the cells that a continued search has examined and has not."""
     return f"{store.count} cells kept from before, {store.open_blocks} blocks of cells still to be examined"
 
 
 def say_if_late(console: Any, document: dict[str, Any]) -> None:
-    """Name the way to go on with a search that the time budget ended."""
+    """Print how to continue a search, if the time budget ended it."""
     if document["state"] == "budget":
         console.print("the time budget ended first: go on with --resume")
 
@@ -133,7 +133,7 @@ def locate_photos(options: Locate, stop: SignalStop) -> None:
 
 
 def _tell(console: Any, location: Location) -> None:
-    """Print what is looked for."""
+    """Print the calibration, the number of pixels that may be outliers, and warnings."""
     method, photo, calibration = location.job.method, location.photo, location.calibration
     if calibration is not None:
         text = f"calibrated on {calibration.photos} training photos ({calibration.psnr:.1f} dB): noise"

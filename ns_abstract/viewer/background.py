@@ -79,7 +79,7 @@ class _Process:
         self._outbox.put(message)
 
     def end(self) -> None:
-        """Kill the process; nothing is lost with it."""
+        """Kill the process, which holds no results."""
         self._outbox.put(None)
         self.process.kill()
 
@@ -169,7 +169,7 @@ class Background:
             return snapshot
 
     def more(self, seconds: float) -> None:
-        """Go on for ``seconds`` with the view that was asked for last."""
+        """Refine the view of the newest request for ``seconds`` more."""
         with self._lock:
             if self._wanted is not None and self._source is not None:
                 _, key, view, _ = self._wanted
@@ -178,7 +178,7 @@ class Background:
 
     @property
     def status(self) -> Status:
-        """What the background does now."""
+        """Return the present state of the background process."""
         with self._lock:
             if self._source is None or self._closed:
                 return Status("off")
@@ -284,7 +284,7 @@ class Background:
         self._tell()
 
     def _tell(self) -> None:
-        """Tell who looks that there may be something new."""
+        """Call ``changed``: there may be new bounds or another status."""
         try:
             self.changed()
         except Exception as error:

@@ -151,11 +151,11 @@ class Snapshot:
 
     @property
     def untreated(self) -> int:
-        """Pixels of which nothing is known: [0, 1] in every channel."""
+        """Number of pixels without bounds: [0, 1] in every channel."""
         return int(((self.lower == 0.0) & (self.upper == 1.0)).all(axis=-1).sum())
 
     def says_less(self, other: Snapshot) -> bool:
-        """Whether nothing is known of a larger part of this picture than of ``other``."""
+        """Whether a larger part of this picture than of ``other`` has no bounds."""
         return self.untreated * other.size[0] * other.size[1] > other.untreated * self.size[0] * self.size[1]
 
     @property
@@ -185,7 +185,7 @@ class Source(ABC):
     @property
     @abstractmethod
     def about(self) -> str:
-        """What is bounded where that is not the picture on screen, for people; or ""."""
+        """Sentence on the bounded picture if it is not the one on screen; else ""."""
 
     @property
     @abstractmethod
@@ -227,7 +227,7 @@ class SplatSource(Source):
 
     @property
     def about(self) -> str:
-        """Whose pictures are bounded, where the version was asked for."""
+        """Sentence on the gsplat version whose pictures are bounded, if it was asked for; else ""."""
         return "" if self.version is None else f"Bounds of the pictures of gsplat {self.version}."
 
     @property
