@@ -9,7 +9,6 @@ from pathlib import Path
 
 import numpy as np
 import onnx
-import onnxruntime
 import pytest
 import torch
 from mpmath import mp
@@ -17,9 +16,10 @@ from onnx import TensorProto, helper, numpy_helper
 from onnx_files import OnnxFile
 
 from ns_abstract.io.errors import InputError
-from ns_abstract.verify.network import ImageSets, bound_outputs, load_network
+from ns_abstract.verify.network import ImageSets, bound_outputs, byte_sums, load_network
+from ns_abstract.verify.network.byte_sums import bytes_are_summed_exactly
 from ns_abstract.verify.network.interpolation import nearest_pixels
-from ns_abstract.verify.network.load import onnx_runner
+from ns_abstract.verify.network.load import onnx_runner, read_onnx
 from ns_abstract.verify.vnnlib import load_query, load_vnnlib
 
 CASES = Path(__file__).resolve().parents[2] / "shared" / "data" / "network_cases"
@@ -35,22 +35,6 @@ def at(file: Path, x: np.ndarray, arithmetic: str = "float32", **given: object) 
     rows = np.concatenate([np.eye(size), -np.eye(size)])
     found = bound_outputs(network, images, rows, np.zeros(2 * size), arithmetic=arithmetic).lower[0]  # type: ignore[arg-type]
     return found[:size], -found[size:]
-
-
-def bytes_are_summed_exactly() -> bool:
-    """Whether onnxruntime sums products of bytes in 32 bits here; without VNNI it saturates pairs of them."""
-    x = helper.make_tensor_value_info("x", TensorProto.UINT8, [1, 4])
-    y = helper.make_tensor_value_info("y", TensorProto.INT32, [1, 1])
-    weights = numpy_helper.from_array(np.full((4, 1), 127, np.int8), "w")
-    graph = helper.make_graph([helper.make_node("MatMulInteger", ["x", "w"], ["y"])], "bytes", [x], [y], [weights])
-    model = helper.make_model(graph, opset_imports=[helper.make_opsetid("", 13)], ir_version=8)
-    session = onnxruntime.InferenceSession(model.SerializeToString(), providers=["CPUExecutionProvider"])
-    return int(session.run(None, {"x": np.full((1, 4), 255, np.uint8)})[0][0, 0]) == 4 * 255 * 127
-
-
-needs_exact_bytes = pytest.mark.skipif(
-    not bytes_are_summed_exactly(), reason="onnxruntime saturates sums of products of bytes on this processor"
-)
 
 
 def run(file: Path, x: np.ndarray, output: str = "") -> np.ndarray:
@@ -532,9 +516,9 @@ def quantised(f: OnnxFile, x: str, scale: float, zero: int, kind: type = np.uint
 
 
 def integer_constants(f: OnnxFile, rng: np.random.Generator, shape: tuple[int, ...], step: float) -> tuple[str, str]:
-    """Weights of 8 bits and a bias of 32 bits for 6 results, for values in steps of ``step``."""
-    fine = f.constant(0.005)
-    w = f.node("DequantizeLinear", f.constant(rng.integers(-127, 128, shape), np.int8), fine)
+    """Weights of 8 bits (7, if sums of bytes saturate) and a bias of 32 bits for 6 results, for steps of ``step``."""
+    fine, most = f.constant(0.005), 127 if bytes_are_summed_exactly() else 64
+    w = f.node("DequantizeLinear", f.constant(rng.integers(-most, most + 1, shape), np.int8), fine)
     bias = f.constant(rng.integers(-2000, 2000, 6), np.int32)
     return w, f.node("DequantizeLinear", bias, f.constant(np.float32(0.005) * np.float32(step)))
 
@@ -563,7 +547,6 @@ def test_stored_integers_are_weights(axis: int | None, tmp_path: Path) -> None:
     assert (low <= value).all() and (value <= high).all()
 
 
-@needs_exact_bytes
 @pytest.mark.slow
 @pytest.mark.parametrize("seed", range(3))
 def test_values_that_are_rounded_to_steps_are_contained(seed: int, tmp_path: Path) -> None:
@@ -634,7 +617,6 @@ def test_floats_that_onnxruntime_rounds_are_refused(
         load_network(product_of_steps(tmp_path / "net.onnx", product, floats, before, behind))
 
 
-@needs_exact_bytes
 @pytest.mark.parametrize("product, behind", [("Gemm", ""), ("Gemm", "end"), ("Conv", "Relu"), ("MatMul", "")])
 @pytest.mark.parametrize("kind", ["scale", "zero", "alpha"])
 def test_a_bias_whose_scale_onnxruntime_does_not_read_is_refused(
@@ -660,7 +642,6 @@ def test_a_bias_whose_scale_onnxruntime_does_not_read_is_refused(
         load_network(file)
 
 
-@needs_exact_bytes
 @pytest.mark.parametrize("product, floats, behind", [("Gemm", "weights, bias", "end"), ("Conv", "weights, bias", "end"),
     ("Gemm", "", ""), ("Conv", "", "Relu"), ("MatMul", "", "")])  # fmt: skip
 def test_products_of_steps_that_are_not_rounded_are_contained(
@@ -674,6 +655,74 @@ def test_products_of_steps_that_are_not_rounded_are_contained(
         assert (low <= value).all() and (value <= high).all()
 
 
+def sums_at_their_ends(file: Path, product: str, most: int, steps: type, stored: type = np.int8) -> np.ndarray:
+    """A product of 64 values with weights all ``most``, and inputs at both ends of the steps."""
+    f = OnnxFile((64, 1, 1) if product == "Conv" else (64,))
+    shape = {"Conv": (6, 64, 1, 1), "MatMul": (64, 6), "Gemm": (6, 64)}[product]
+    w = f.node("DequantizeLinear", f.constant(np.full(shape, most), stored), f.constant(0.01))
+    x = quantised(f, "image", 0.02, 0, steps)
+    f.node(product, x, w, **({"transB": 1} if product == "Gemm" else {}))
+    quantised(f, f.last, 2.0, 0, steps)
+    f.write(file)
+    return np.stack([np.full((64, *shape[2:]), end, np.float32) for end in (-9.0, 9.0)])
+
+
+@pytest.mark.parametrize("product", ["Conv", "MatMul", "Gemm"])
+@pytest.mark.parametrize("most, stored", [(127, np.int8), (-128, np.int8), (64, np.int8), (255, np.uint8)])
+@pytest.mark.parametrize("steps", [np.int8, np.uint8])
+def test_sums_of_bytes_are_contained_or_refused(
+    product: str, most: int, stored: type, steps: type, tmp_path: Path
+) -> None:
+    """onnxruntime saturates sums of pairs where the processor cannot add products of bytes in 32 bits."""
+    file = tmp_path / "net.onnx"
+    points = sums_at_their_ends(file, product, most, steps, stored)
+    if abs(most) > 64 and stored is np.int8 and not bytes_are_summed_exactly():
+        with pytest.raises(InputError, match="int8 weights beyond 64, whose products saturate"):
+            read_onnx(file)
+        return
+    for point in points:
+        low, high = at(file, point)
+        value = run(file, point)
+        assert (low <= value).all() and (value <= high).all()
+
+
+def test_bytes_are_refused_where_their_sums_saturate(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(byte_sums, "bytes_are_summed_exactly", lambda: False)
+    file = tmp_path / "net.onnx"
+    for most, stored in ((64, np.int8), (-64, np.int8), (255, np.uint8)):
+        sums_at_their_ends(file, "Gemm", most, np.uint8, stored)
+        read_onnx(file)
+    for most in (65, -128):
+        sums_at_their_ends(file, "Gemm", most, np.uint8)
+        with pytest.raises(InputError, match=r"int8 weights beyond 64.*saturate") as caught:
+            read_onnx(file)
+        assert "reduce_range" in (caught.value.fix or "")
+    f = OnnxFile((4,))
+    f.node(
+        "Gemm", f.last, f.node("DequantizeLinear", f.constant(np.full((3, 4), 127), np.int8), f.constant(0.1)), transB=1
+    )
+    read_onnx(f.write(file))
+
+
+@pytest.mark.parametrize("through", ["", "Identity"])
+def test_signed_second_operands_are_refused_where_sums_saturate(
+    through: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(byte_sums, "bytes_are_summed_exactly", lambda: False)
+    for kind, refused in ((np.uint8, False), (np.int8, True)):
+        f = OnnxFile((4,))
+        first = quantised(f, f.node("Reshape", "image", f.constant([1, 2, 2], np.int64)), 0.1, 0, kind)
+        second = f.node(through, first) if through else first
+        f.node("MatMul", first, second)
+        f.node("Flatten")
+        f.write(tmp_path / "net.onnx")
+        if refused:
+            with pytest.raises(InputError, match=r"int8 values to MatMul .* as its second operand"):
+                read_onnx(tmp_path / "net.onnx")
+        else:
+            read_onnx(tmp_path / "net.onnx")
+
+
 def bytes_times_values(file: Path, through: str, product: str, integers: type = np.int8) -> Path:
     """Values near 1/2 times a matrix of stored integers, and a constant that hides small differences."""
     f, rng = OnnxFile((8,)), np.random.default_rng(0)
@@ -682,7 +731,8 @@ def bytes_times_values(file: Path, through: str, product: str, integers: type = 
     x = f.node("Sigmoid")
     if through == "steps":
         x = quantised(f, x, 1.0 / 255.0, 0)
-    given = [f.constant(rng.integers(-128, 128, (8, 8)), integers), f.constant(0.001), f.constant(0, integers)]
+    most = 127 if bytes_are_summed_exactly() else 64
+    given = [f.constant(rng.integers(-most, most + 1, (8, 8)), integers), f.constant(0.001), f.constant(0, integers)]
     w = f.node("DequantizeLinear", *given)
     if through not in ("", "steps"):
         w = f.node(through, w)

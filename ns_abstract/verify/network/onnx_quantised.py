@@ -7,6 +7,7 @@ import onnx
 
 from ns_abstract.arithmetic.network_charges import LEAST_DIVISOR
 from ns_abstract.io.errors import InputError
+from ns_abstract.verify.network.byte_sums import refuse_saturating_operand, refuse_saturating_weights
 from ns_abstract.verify.network.composite_activations import Quantised
 from ns_abstract.verify.network.constant_enclosures import EnclosedConstant, exact_constant, scaled_integers
 from ns_abstract.verify.network.onnx_choices import without_choices
@@ -48,6 +49,7 @@ def dequantize(r: OnnxReader, node: onnx.NodeProto, a: Attributes) -> None:
             raise InputError(f"reads type {q.dtype}", fix="store integers")
         if q.dtype.itemsize == 1:
             _refuse_products(r, node)
+        refuse_saturating_weights(r.graph, q)
         number = q.astype(np.int64) - (0 if zero is None else _along(zero.astype(np.int64), q.ndim, axis))
         dequantised = scaled_integers(number, exact_constant(_along(scale, q.ndim, axis)))
         if isinstance(dequantised, EnclosedConstant):
@@ -174,6 +176,16 @@ def _refuse_tables(r: OnnxReader, node: onnx.NodeProto) -> None:
         raise InputError(f"rounds {softmax.name or softmax.output[0]} (Softmax) of steps to 8 bits", fix=fix)
 
 
+def _refuse_signed_operands(r: OnnxReader, node: onnx.NodeProto) -> None:
+    """Refuse a product whose second operand is rounded to signed bytes by ``node``, if its sums may saturate (N25)."""
+    steps = set(node.output)
+    for reader in r.graph.node:
+        if reader.op_type in _PRODUCTS and reader.input[1] in steps:
+            refuse_saturating_operand(reader)
+        elif reader.op_type in ("DequantizeLinear", *_PASSED) and not steps.isdisjoint(reader.input):
+            steps.update(reader.output)
+
+
 def quantize(r: OnnxReader, node: onnx.NodeProto, a: Attributes) -> None:
     """Read QuantizeLinear, which rounds a value to steps; its readers must dequantise it."""
     a.ignore("axis", "saturate")
@@ -188,6 +200,8 @@ def quantize(r: OnnxReader, node: onnx.NodeProto, a: Attributes) -> None:
         raise InputError(f"scale {step:g} of type {kind}", fix="use 8 or 16 bits and one positive scale")
     if kind.itemsize == 1:
         _refuse_tables(r, node)
+    if kind == np.int8:
+        _refuse_signed_operands(r, node)
     offset = 0 if zero is None else int(np.reshape(zero, -1)[0])
     low, high = (step * (end - offset) for end in _RANGES[kind])
     index = r.builder.curve(x.index, Quantised, least=low, most=high, step=step)
