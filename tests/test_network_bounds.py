@@ -211,9 +211,9 @@ def test_rows_that_end_on_the_way_lie_below_the_exact_minimum(
 ) -> None:
     """Rows for all numbers of a layer may end at an earlier one: what they say there holds, and is not for nothing."""
     monkeypatch.setattr(cost_model, "_DEEP", 0.0)
-    monkeypatch.setattr(work_budget, "_CHEAP", 0.0)
-    monkeypatch.setattr(work_budget, "_RENEW", -1.0)
-    monkeypatch.setattr(work_budget, "_ENOUGH", enough)
+    monkeypatch.setattr(work_budget, "_SMALL_SHARE", 0.0)
+    monkeypatch.setattr(work_budget, "_MANY_UNSTABLE", -1.0)
+    monkeypatch.setattr(work_budget, "_STOPPING_WIDTH", enough)
     ended, said, gaps, spans = 0, {}, 0.0, 0.0
     one_hot, bounded = NeuronBounds._one_hot, NeuronBounds.bounded
 
@@ -260,10 +260,10 @@ def planned(monkeypatch: pytest.MonkeyPatch, which: int | None = None) -> list[c
     if which is not None:
 
         def ways(run: work_budget.WorkBudget, index: int, _: int) -> tuple[list[cost_model.BackwardRoute], float]:
-            known = run.costs.ways(index)
+            known = run.costs.routes(index)
             return [known[min(which, len(known) - 1)]], 0.0
 
-        monkeypatch.setattr(work_budget.WorkBudget, "ways", ways)
+        monkeypatch.setattr(work_budget.WorkBudget, "routes", ways)
     used: list[cost_model.BackwardRoute] = []
     ready = IntermediateBounds.ready
 
@@ -369,9 +369,9 @@ def test_rows_that_rest_on_several_nodes(
             assert bool((lower <= values[at] + room).all()) and bool((values[at] - room <= upper).all())
         assert (found[0].lower[0] <= rows @ values[-1][0].numpy()).all()
     if which in (0, 1):
-        assert max(len(way.rests) for way in used) > 1
+        assert max(len(way.ends) for way in used) > 1
     middle = rows @ network(torch.from_numpy(0.5 * (images.lower + images.upper)).reshape(1, *shape)).numpy().T
-    monkeypatch.setattr(work_budget.WorkBudget, "ways", lambda *_: ([], 0.0))
+    monkeypatch.setattr(work_budget.WorkBudget, "routes", lambda *_: ([], 0.0))
     none = bound_outputs(network, images, rows, np.zeros(4), arithmetic="real")
     gaps = [(middle.T - one.lower).mean() for one in (found[0], none)]
     assert gaps[0] <= (0.8 if which is None else 1.05) * gaps[1]
@@ -476,7 +476,9 @@ def test_plans_keep_to_what_is_allowed(tmp_path: Path, monkeypatch: pytest.Monke
     for part in (10.0, 0.3, 0.1, 0.03):
         plan = costs.plan(part * costs.total, [1e-4], 1.0)
         assert plan.products <= part * costs.total
-        assert plan.products == pytest.approx(sum(costs.bounded[k] * way.price for k, way in plan.ways.items()))
+        assert plan.products == pytest.approx(
+            sum(costs.refined_counts[k] * way.price for k, way in plan.routes.items())
+        )
         widest.append(plan.widest)
     assert sorted(widest) == widest and widest[-1] > 10.0 * widest[0]
     # where bounds are close enough in any case, no rows are worth their price
@@ -485,8 +487,8 @@ def test_plans_keep_to_what_is_allowed(tmp_path: Path, monkeypatch: pytest.Monke
     monkeypatch.setattr(cost_model, "_DEEP", 0.0)
     run = work_budget.WorkBudget(network)
     for k in range(4):
-        run.learns(k, 1e9, 1.0)
-    run.ways(3, 512)
+        run.record_width(k, 1e9, 1.0)
+    run.routes(3, 512)
     assert run.left == 0.0, "nothing is spent on bounds that cannot say anything"
 
 
@@ -528,7 +530,7 @@ def test_early_rows_keep_later_ones_exact(tmp_path: Path, monkeypatch: pytest.Mo
     middle = rows @ network(torch.from_numpy(0.5 * (images.lower + images.upper)).reshape(1, *shape)).numpy().T
     gaps = []
     for cheap in (0.0, 0.03):
-        monkeypatch.setattr(work_budget, "_CHEAP", cheap)
+        monkeypatch.setattr(work_budget, "_SMALL_SHARE", cheap)
         cells = NetworkBounds(network, images, 1 << 30, "real")
         # rows of outputs in float64 lose next to nothing of themselves
         cells.intermediate.relaxations.pop()
@@ -626,7 +628,7 @@ def test_curves_are_bounded_by_what_rows_leave(deep: bool, tmp_path: Path, monke
     if deep:
         monkeypatch.setattr(cost_model, "_DEEP", 0.0)
         # nor are all numbers of a node bounded for another reason
-        monkeypatch.setattr(work_budget, "_CHEAP", 0.0)
+        monkeypatch.setattr(work_budget, "_SMALL_SHARE", 0.0)
     found = bound_outputs(network, images, rows, np.zeros(3), arithmetic="real").lower
     with monkeypatch.context() as patch:
         patch.setattr(neuron_selection, "_HALF", -1.0)
@@ -644,9 +646,9 @@ def test_curves_are_bounded_by_what_rows_leave(deep: bool, tmp_path: Path, monke
 def test_deep_networks_are_given_up_early(tmp_path: Path) -> None:
     network = load_network(residual(tmp_path))
     run = work_budget.WorkBudget(network)
-    assert run.vain(0.95, 0.0, 0.1) and run.left > 0.0
-    assert not run.vain(0.5, 0.5, 0.9) and run.left > 0.0
-    assert run.vain(0.5, 0.95, 0.9) and run.left == 0.0
+    assert run.is_futile(0.95, 0.0, 0.1) and run.left > 0.0
+    assert not run.is_futile(0.5, 0.5, 0.9) and run.left > 0.0
+    assert run.is_futile(0.5, 0.95, 0.9) and run.left == 0.0
 
 
 @pytest.mark.slow
@@ -657,8 +659,8 @@ def test_rows_cost_what_their_windows_hold(tmp_path: Path) -> None:
     layer = network.nodes[first - 1].layer
     assert isinstance(layer, Convolution)
     # one number of the first convolution: its channels there, the weights, and its window of the image
-    assert costs.row(first) == cost_model._PASSING * (6 + 18) + layer.weight.numel()
-    assert costs.row(len(network.nodes)) > 10 * costs.row(first)
+    assert costs.pass_price(first) == cost_model._PASSING * (6 + 18) + layer.weight.numel()
+    assert costs.pass_price(len(network.nodes)) > 10 * costs.pass_price(first)
 
 
 def test_a_point_and_a_constant_image(tmp_path: Path) -> None:

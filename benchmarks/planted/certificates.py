@@ -50,25 +50,25 @@ CERTIFICATES = (
     ),
     Fault(
         "families: rows that were passed back with a negative sign keep it",
-        _FAMILY, "_ReusingCells._said", "middle * stored.sign", "middle", _SHARED + "[]",
+        _FAMILY, "_ReusingCells._stored_bounds", "middle * stored.sign", "middle", _SHARED + "[]",
     ),
     Fault(
         "families: the cell's own width is left out",
-        _FAMILY, "_ReusingCells._said", "half[0] + spread", "0.0 * half[0] + spread", _SHARED + "[]",
+        _FAMILY, "_ReusingCells._stored_bounds", "half[0] + spread", "0.0 * half[0] + spread", _SHARED + "[]",
     ),
     Fault(
         "families: activations are taken to follow the first cell's slopes",
-        _FAMILY, "_ReusingCells._said", "spread[here] += sizes[:, -1]", "spread[here] += 0.0 * sizes[:, -1]",
+        _FAMILY, "_ReusingCells._stored_bounds", "spread[here] += sizes[:, -1]", "spread[here] += 0.0 * sizes[:, -1]",
         _SHARED + "[]",
     ),
     Fault(
         "families: what rows gathered at products is forgotten",
-        _FAMILY, "_ReusingCells._said", "middle + 0.5 * (low + high)", "middle",
+        _FAMILY, "_ReusingCells._stored_bounds", "middle + 0.5 * (low + high)", "middle",
         "test_cover.py::test_products_of_rows_are_charged[product]",
     ),
     Fault(
         "families: what float32 products lose is not charged",
-        _FAMILY, "_ReusingCells._said", "loses / (1.0 - loses)", "0.0",
+        _FAMILY, "_ReusingCells._stored_bounds", "loses / (1.0 - loses)", "0.0",
         "test_cover.py::test_products_of_rows_are_charged[]",
     ),
     Fault(
@@ -281,7 +281,7 @@ CERTIFICATES = (
     ),
     Fault(
         "branching: multipliers forget the reference",
-        _SLOPES, "SplitNeurons.pay", "gained.astype(np.float64) @ self.reference - room", "-room", _BRANCHES,
+        _SLOPES, "SplitNeurons.lagrangian_terms", "gained.astype(np.float64) @ self.reference - room", "-room", _BRANCHES,
     ),
     Fault(
         "branching: the margin is that of the last group",

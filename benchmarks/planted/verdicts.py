@@ -294,7 +294,7 @@ VERDICTS = (
     Fault(
         "network: rows are asked for where forms are good, and not where they are loose",
         _SELECTION,
-        "NeuronSelection._bent",
+        "NeuronSelection._refine_curved",
         "width_ratio > _HALF",
         "width_ratio < _HALF",
         "test_network_bounds.py::test_curves_are_bounded_by_what_rows_leave[False]",
@@ -318,8 +318,8 @@ VERDICTS = (
     Fault(
         "network: forms of cheap nodes stay loose where nothing is open",
         "verify/network/work_budget.py",
-        "WorkBudget.renews",
-        "products < self._cheap",
+        "WorkBudget.refines_all",
+        "products < self._small_amount",
         "False",
         "test_network_bounds.py::test_early_rows_keep_later_ones_exact",
     ),
@@ -350,7 +350,7 @@ VERDICTS = (
     Fault(
         "network: rows are passed where nothing will be known in the end",
         "verify/network/work_budget.py",
-        "WorkBudget.ways",
+        "WorkBudget.routes",
         "plan.widest > HOPELESS_WIDTH * self._size",
         "False",
         "test_network_bounds.py::test_plans_keep_to_what_is_allowed",

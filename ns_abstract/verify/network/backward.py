@@ -137,8 +137,8 @@ class BackwardPass:
                     return
             here = batch.waiting.pop(at)
             node = self.network.nodes[at - 1]
-            if batch.chosen is not None and at in batch.chosen.paid:
-                flat, gained, offset = batch.chosen.paid[at]
+            if batch.chosen is not None and at in batch.chosen.multiplier_terms:
+                flat, gained, offset = batch.chosen.multiplier_terms[at]
                 here = full(here, node.layer.shape, force=True)
                 here.value.reshape(len(here.value), -1)[:, flat] += gained[batch.number]
                 batch.total[:, 0] += offset[batch.number]

@@ -132,7 +132,7 @@ class NetworkBounds:
                 source = node.inputs[0]
                 interval = inputs[0].interval
                 unstable, apart = node.layer.unstable(*interval), node.layer.relaxation_gap(*interval)
-                forms[source] = inputs[0] = self._selection.better(source, inputs[0], unstable, apart, node.layer)
+                forms[source] = inputs[0] = self._selection.refine(source, inputs[0], unstable, apart, node.layer)
                 if isinstance(node.layer, LeakyRelu):
                     self._selection.unsure = float(node.layer.unstable(*inputs[0].interval).double().mean())
                 forms.append(self._propagation.activation(k, source, node.layer, inputs[0]))
@@ -142,7 +142,7 @@ class NetworkBounds:
                 intervals = inputs[0].interval, inputs[1].interval
                 unstable, apart = node.layer.unstable(*intervals), node.layer.relaxation_gap(*intervals)
                 for position, source in enumerate(node.inputs):
-                    forms[source] = inputs[position] = self._selection.better(source, inputs[position], unstable, apart)
+                    forms[source] = inputs[position] = self._selection.refine(source, inputs[position], unstable, apart)
                 forms.append(self._propagation.product(k, node.inputs, node.layer, inputs[0], inputs[1]))
             elif isinstance(node.layer, MaxPool):
                 forms.append(self._pooling.maximum(k, node.inputs[0], node.layer, inputs[0]))
@@ -165,11 +165,11 @@ class NetworkBounds:
         if cut:
             above = form.interval.upper > 0.0
             r = r[above] if bool(above.any()) else r
-        self._schedule.learns(index, float(r.mean()), float(form.reference.abs().mean()))
+        self._schedule.record_width(index, float(r.mean()), float(form.reference.abs().mean()))
 
     def _leave(self, index: int) -> None:
         """Record that every reader of node ``index`` has read it; later rows may end there (N18)."""
         form = self.intermediate.forms[index]
-        if index in self._schedule.rests and index not in self.intermediate.stops:
+        if index in self._schedule.end_nodes and index not in self.intermediate.stops:
             assert form is not None
             self.intermediate.stops[index] = self.intermediate.stop(index, form)

@@ -45,10 +45,10 @@ class CoefficientSource:
         return None
 
     def reuse_bounds(
-        self, index: int, form: NodeForm, unstable: Tensor, apart: Tensor | None, layer: Activation | None
+        self, index: int, form: NodeForm, unstable: Tensor, gaps: Tensor | None, layer: Activation | None
     ) -> tuple[NodeForm, Tensor, Tensor | None]:
         """Return bounds of node ``index``, its unstable neurons, and their relaxation gaps (see `NeuronSelection`)."""
-        return form, unstable, apart
+        return form, unstable, gaps
 
     def trace(self, count: int) -> BackwardTrace | None:
         """Return memory for the coefficients of ``count`` rows that are to be stored, or None (N15)."""

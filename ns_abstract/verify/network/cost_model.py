@@ -31,34 +31,34 @@ from ns_abstract.verify.network.layers import (
 from ns_abstract.verify.network.max_pooling import MaxPool
 from ns_abstract.verify.network.sparse_layers import PairwiseDifferences, SparseMatrix, TransposedConvolution
 
-#: Products of a convolution in the time in which a kernel passes one number of a row.
+#: Preference: a convolution makes so many multiplications in the time in which a kernel passes one coefficient on.
 _PASSING = 40.0
-#: A network is deep if rows for all of its numbers take more products than this; about a minute of one core.
+#: Preference: a network is deep if refining all of its neurons takes more multiplications; a minute of one core.
 _DEEP = 2e12
-#: Products that rows for inner nodes may take in one cell of a deep network; about three minutes of one core.
+#: Preference: multiplications for inner neurons in one cell of a deep network; about three minutes of one core.
 ALLOWED_PRODUCTS = 5e12
-#: Products that rows may take in one cell of a network whose rows end by plan; about six minutes of one core.
+#: Preference: multiplications in one cell where backward passes end by plan; about six minutes of one core.
 PLANNED_PRODUCTS = 1.5e13
-#: Where rows for all numbers take so many times more than is allowed, they end by plan.
+#: Preference: where refining all neurons takes so many times what is allowed, backward passes end by plan.
 _OVER = 1.5
-#: Plans that are compared at first, and to either side of one made before; in the first of them rows for all numbers
-#: cost so much (a logarithm of widths). By how much rows have to be the better.
+#: Preferences: plans that are compared at first, and on either side of an earlier plan; the price of all passes in the
+#: first plan, and the least gain of a pass, both in logarithms of widths.
 _STEPS, _LIKE, _DEAREST, _CLOSE = 64, 6, 2.0**18, 0.1
-#: Factor between the prices of two ways.
+#: Preference: a longer route costs at least so many times the shorter one.
 _APART = 1.2
-#: Part of its inputs that an activation passes on.
+#: Estimate: the fraction of its inputs that an activation passes on.
 _ACTIVE = 0.5
-#: Width, as a part of a node's numbers, that is close enough.
+#: Preference: width, relative to a node's magnitude, that is tight enough.
 _FINE = 1e-4
-#: What an activation adds to bounds of its input relative to these and to numbers' sizes, and rows of themselves.
+#: Estimates: the widening by an activation, relative to its input's width squared over magnitude, and by a pass itself.
 _BENDS, _ROUNDS = 0.1, 5e-5
-#: Width past which nothing is foreseen.
+#: Largest width that is predicted.
 _HUGE = 1e100
-#: Width of bounds, as a part of numbers, past which nothing is worth any rows if it is foreseen.
+#: Preference: predicted width, relative to magnitudes, past which no backward pass is worth its price.
 HOPELESS_WIDTH = 1e3
-#: Numbers of a node that ways are tried with.
+#: Preference: neurons of a node with which routes are tried.
 TRIALS = 32
-#: Layers whose rows stay in their windows.
+#: Layers through which the coefficients of a neuron stay in their window.
 _WINDOWED = (Activation, ChannelEmbedding, Pad, Product, ScaleLayer, Sum)
 
 
@@ -72,26 +72,26 @@ class BackwardRoute(NamedTuple):
     Attributes:
         cut: The pass ends at nodes up to this one; 0: it ends at the image.
         price: Multiplications.
-        rests: By node where it ends: the sum of its coefficients' magnitudes, estimated.
-        passed: The same for nodes in front of an activation or a product that it passes through.
+        ends: By node where it ends: the sum of its coefficients' magnitudes, estimated.
+        relaxed: The same for nodes in front of an activation or a product that it passes through.
         maxima: The same for maxima that it passes through.
     """
 
     cut: int
     price: float
-    rests: tuple[tuple[int, float], ...]
-    passed: tuple[tuple[int, float], ...]
+    ends: tuple[tuple[int, float], ...]
+    relaxed: tuple[tuple[int, float], ...]
     maxima: tuple[tuple[int, float], ...]
 
-    def spread(self, intermediate: list[float], size: float) -> float:
-        """Return its estimated width, if earlier nodes' are ``intermediate`` wide, of numbers about ``size``."""
+    def predicted_width(self, intermediate: list[float], size: float) -> float:
+        """Return the predicted width of bounds by this route, given the widths of earlier nodes and their magnitude."""
         total = 0.0
-        for at, sum_ in self.rests:
+        for at, sum_ in self.ends:
             total += sum_ * intermediate[at]
-        for at, sum_ in self.passed:
+        for at, sum_ in self.relaxed:
             total += sum_ * intermediate[at] * (_BENDS * intermediate[at] / size + _ROUNDS)
         for at, sum_ in self.maxima:
-            # where numbers are as good as equal, nothing is known of the greatest but its bounds
+            # among nearly equal numbers, the greatest is known by its bounds alone
             total += sum_ * intermediate[at]
         return total
 
@@ -100,13 +100,13 @@ class RefinementPlan(NamedTuple):
     """A plan of which neurons of a network are refined in a cell (N18).
 
     Attributes:
-        ways: By node: the route of rows for all of its numbers.
+        routes: By node: the route of the backward passes of all of its neurons.
         products, rate: Multiplications in all, and the price of one in logarithms of widths.
         widest: Largest predicted width of a node's bounds.
         step: Its number among the compared plans.
     """
 
-    ways: dict[int, BackwardRoute]
+    routes: dict[int, BackwardRoute]
     products: float
     widest: float
     rate: float
@@ -118,20 +118,20 @@ class CostModel:
 
     def __init__(self, network: Network) -> None:
         self.network = network
-        self._ways: dict[int, list[BackwardRoute]] = {}
+        self._routes: dict[int, list[BackwardRoute]] = {}
 
-    def row(self, index: int) -> float:
+    def pass_price(self, index: int) -> float:
         """Return the multiplications of a backward pass from one number of node ``index`` to the image."""
-        return self.ways(index)[-1].price
+        return self.routes(index)[-1].price
 
-    def ways(self, index: int) -> list[BackwardRoute]:
+    def routes(self, index: int) -> list[BackwardRoute]:
         """Return the routes of a pass from one number of node ``index``, the shortest first, the image's last."""
-        if index not in self._ways:
-            self._ways[index] = self._passed(index)
-        return self._ways[index]
+        if index not in self._routes:
+            self._routes[index] = self._computed_routes(index)
+        return self._routes[index]
 
     @cached_property
-    def _ends(self) -> set[int]:
+    def _possible_ends(self) -> set[int]:
         """Nodes at which passes may end early: those that are refined, and maxima."""
         ends = set()
         for k, node in enumerate(self.network.nodes, 1):
@@ -142,39 +142,39 @@ class CostModel:
         return ends
 
     @cached_property
-    def rests(self) -> set[int]:
+    def end_nodes(self) -> set[int]:
         """Nodes other than the image at which a pass from any node may end."""
         last = [0] * (len(self.network.nodes) + 1)
         for k, node in enumerate(self.network.nodes, 1):
             for source in node.inputs:
                 last[source] = k
-        rests: set[int] = set()
-        for cut in self._ends:
-            rests.update(k for k in range(1, cut + 1) if last[k] > cut)
-        return rests
+        end_nodes: set[int] = set()
+        for cut in self._possible_ends:
+            end_nodes.update(k for k in range(1, cut + 1) if last[k] > cut)
+        return end_nodes
 
-    def _passed(self, index: int) -> list[BackwardRoute]:
-        """Return `ways`, computed by following the pass's windows node by node."""
-        # rows and columns of a window, channels in use, and the coefficients' squares together
-        windows, total, ways = {index: (1, 1, 1.0, 1.0)}, 0.0, []
-        passed: list[tuple[int, float]] = []
+    def _computed_routes(self, index: int) -> list[BackwardRoute]:
+        """Return `routes`, computed by following the pass's windows node by node."""
+        # by node: height and width of the window, channels in use, and the sum of squared coefficients
+        windows, total, routes = {index: (1, 1, 1.0, 1.0)}, 0.0, []
+        relaxed: list[tuple[int, float]] = []
         maxima: list[tuple[int, float]] = []
         for at in range(index, 0, -1):
-            if at != index and at in self._ends:
-                way = self._way(at, windows, total, passed, maxima)
-                if not ways or way.price > _APART * ways[-1].price:
-                    ways.append(way)
+            if at != index and at in self._possible_ends:
+                route = self._route_to(at, windows, total, relaxed, maxima)
+                if not routes or route.price > _APART * routes[-1].price:
+                    routes.append(route)
             if at not in windows:
                 continue
             h, w, used, squares = windows.pop(at)
-            if at != index and at in self._ends:
-                chosen = maxima if isinstance(self.network.nodes[at - 1].layer, MaxPool) else passed
+            if at != index and at in self._possible_ends:
+                chosen = maxima if isinstance(self.network.nodes[at - 1].layer, MaxPool) else relaxed
                 chosen.append((at, _together(h * w * used, squares)))
             node = self.network.nodes[at - 1]
             layer = node.layer
             channels = grid(self.network.shape(at))[0]
             total += _PASSING * channels * h * w
-            squares *= self._sizes[at][1]
+            squares *= self._weight_sums[at][1]
             if isinstance(layer, Convolution):
                 groups = layer.groups
                 used = min(groups, max(used, 1.0)) * (grid(layer.input_shapes[0])[0] / groups)
@@ -216,24 +216,24 @@ class CostModel:
                     max(window[2], min(used, grid(self.network.shape(source))[0])),
                     window[3] + squares,
                 )
-        ways.append(self._way(0, windows, total, passed, maxima))
-        return ways
+        routes.append(self._route_to(0, windows, total, relaxed, maxima))
+        return routes
 
-    def _way(
+    def _route_to(
         self,
         cut: int,
         windows: dict[int, tuple[int, int, float, float]],
         total: float,
-        passed: list[tuple[int, float]],
+        relaxed: list[tuple[int, float]],
         maxima: list[tuple[int, float]],
     ) -> BackwardRoute:
         """Return the route of a pass that has reached ``windows`` and is concretised there."""
-        bounded = sum(grid(self.network.shape(at))[0] * h * w for at, (h, w, _, _) in windows.items())
+        concretised = sum(grid(self.network.shape(at))[0] * h * w for at, (h, w, _, _) in windows.items())
         sums = {at: _together(h * w * used, squares) for at, (h, w, used, squares) in windows.items()}
-        return BackwardRoute(cut, total + _PASSING * bounded, tuple(sums.items()), tuple(passed), tuple(maxima))
+        return BackwardRoute(cut, total + _PASSING * concretised, tuple(sums.items()), tuple(relaxed), tuple(maxima))
 
     @cached_property
-    def _sizes(self) -> list[tuple[float, float]]:
+    def _weight_sums(self) -> list[tuple[float, float]]:
         """By node: mean sums over one number's weights, of magnitudes and of squares."""
         sizes = [(1.0, 1.0)]
         for node in self.network.nodes:
@@ -258,12 +258,12 @@ class CostModel:
         return sizes
 
     @cached_property
-    def bounded(self) -> dict[int, float]:
-        """By node in front of an activation or a product: estimated count of its numbers that are refined."""
+    def refined_counts(self) -> dict[int, float]:
+        """By node in front of an activation or a product: estimated count of neurons that are refined."""
         costs: dict[int, float] = {}
         for node in self.network.nodes:
             if isinstance(node.layer, (Activation, Product)):
-                # what is certainly cut off needs no rows
+                # neurons that a ReLU surely clips are not refined
                 cut = isinstance(node.layer, LeakyRelu) and node.layer.alpha == 0.0
                 for source in node.inputs:
                     if self.network.depth[source] > 1:
@@ -276,7 +276,7 @@ class CostModel:
         allowed: float,
         intermediate: list[float],
         size: float,
-        bounded: dict[int, float] | None = None,
+        counts: dict[int, float] | None = None,
         near: int | None = None,
     ) -> RefinementPlan:
         """Return the cheapest routes that keep all bounds tight enough, or else as tight as the budget allows.
@@ -285,13 +285,13 @@ class CostModel:
             allowed: Multiplications that the passes may take together.
             intermediate: Widths of the bounds of the first nodes.
             size: Typical magnitude of nodes' numbers.
-            bounded: Better counts than `CostModel.bounded`, where known.
+            counts: Better counts than `CostModel.refined_counts`, where known.
             near: `RefinementPlan.step` of an earlier plan; only similar plans are compared.
         """
-        best, bounded = None, bounded or self.bounded
+        best, counts = None, counts or self.refined_counts
         first, past = (0, _STEPS) if near is None else (max(0, near - _LIKE), min(_STEPS, near + _LIKE + 1))
         for step in range(first, past):
-            plan = self._plan(step, intermediate, size, bounded)
+            plan = self._plan(step, intermediate, size, counts)
             if best is None or (plan.products <= allowed and plan.widest < best.widest):
                 best = plan
             if best.widest <= _FINE * size:
@@ -299,44 +299,44 @@ class CostModel:
         assert best is not None
         return best
 
-    def _plan(self, step: int, intermediate: list[float], size: float, bounded: dict[int, float]) -> RefinementPlan:
+    def _plan(self, step: int, intermediate: list[float], size: float, counts: dict[int, float]) -> RefinementPlan:
         """Return the plan in which every node takes the best route at one price of a multiplication."""
-        spread, ways, total, widest = list(intermediate), {}, 0.0, 0.0
+        widths_by_node, routes, total, widest = list(intermediate), {}, 0.0, 0.0
         rate = _DEAREST / self.total * 2.0 ** (-0.5 * step)
         for k in range(len(intermediate), len(self.network.nodes) + 1):
             node = self.network.nodes[k - 1]
-            near = max(spread[source] for source in node.inputs)
+            near = max(widths_by_node[source] for source in node.inputs)
             if isinstance(node.layer, Activation):
                 near *= 1.0 + _BENDS * near / size
-            near = min(near * self._sizes[k][0], _HUGE)
-            count = bounded.get(k)
+            near = min(near * self._weight_sums[k][0], _HUGE)
+            count = counts.get(k)
             if count is not None:
                 score = log_or_least(near) - _CLOSE
-                for way in self.ways(k):
-                    widths = way.spread(spread, size)
-                    value = log_or_least(widths) + rate * count * way.price
+                for route in self.routes(k):
+                    widths = route.predicted_width(widths_by_node, size)
+                    value = log_or_least(widths) + rate * count * route.price
                     if value < score:
-                        score, near, ways[k] = value, widths, way
+                        score, near, routes[k] = value, widths, route
                 widest = max(widest, near)
-            if k in ways:
-                total += count * ways[k].price
-            spread.append(near)
-        return RefinementPlan(ways, total, widest, rate, step)
+            if k in routes:
+                total += count * routes[k].price
+            widths_by_node.append(near)
+        return RefinementPlan(routes, total, widest, rate, step)
 
     @cached_property
-    def nodes(self) -> list[tuple[int, float]]:
+    def refined_nodes(self) -> list[tuple[int, float]]:
         """Nodes in front of an activation or a product, and the multiplications of passes from all of their numbers."""
         nodes = []
         for node in self.network.nodes:
             if isinstance(node.layer, (Activation, Product)) and self.network.depth[node.inputs[0]] > 1:
                 for source in dict.fromkeys(node.inputs):
-                    nodes.append((source, float(np.prod(self.network.shape(source))) * self.row(source)))
+                    nodes.append((source, float(np.prod(self.network.shape(source))) * self.pass_price(source)))
         return nodes
 
     @cached_property
     def total(self) -> float:
         """Multiplications of passes from every number in front of an activation or a product."""
-        return sum(products for _, products in self.nodes)
+        return sum(products for _, products in self.refined_nodes)
 
     @property
     def deep(self) -> bool:

@@ -106,11 +106,11 @@ class IntermediateBounds:
         arrays = zip((slopes, offsets, form.lower, form.upper), sizes, strict=True)
         return columns_of(*(t.reshape(size).numpy() for t, size in arrays))
 
-    def ready(self, way: BackwardRoute) -> int:
+    def ready(self, route: BackwardRoute) -> int:
         """Prepare the planes of all nodes where a route ends, and return its cut."""
-        for at, _ in way.rests:
+        for at, _ in route.ends:
             if at and at not in self.stops:
                 form = self.forms[at]
                 assert form is not None
                 self.stops[at] = self.stop(at, form)
-        return way.cut
+        return route.cut

@@ -173,11 +173,11 @@ class MaxPoolPropagation:
         pairs = np.stack([window, winner[window], number], 1)
         cut = 0
         if self.schedule.planned:
-            way = self.schedule.nearest(source, len(pairs))
-            if way is None:
+            route = self.schedule.longest_affordable(source, len(pairs))
+            if route is None:
                 return apart
-            cut = self.intermediate.ready(way)
-        elif self.schedule.deep and not self.schedule.takes(len(pairs) * self.schedule.costs.row(source)):
+            cut = self.intermediate.ready(route)
+        elif self.schedule.deep and not self.schedule.spend(len(pairs) * self.schedule.costs.pass_price(source)):
             return apart
         if len(pairs) > _TRIED:
             first = np.arange(0, len(pairs), len(pairs) // _TRIED)

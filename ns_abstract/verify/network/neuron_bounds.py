@@ -144,7 +144,9 @@ class NeuronBounds:
             bounds.put(number, part)
             if self.schedule.deep:
                 ends, count = np.unique(part.ended[part.ended > 0], return_counts=True)
-                self.spared += sum(n * self.schedule.costs.row(int(at)) for at, n in zip(ends, count, strict=True))
+                self.spared += sum(
+                    n * self.schedule.costs.pass_price(int(at)) for at, n in zip(ends, count, strict=True)
+                )
             if trace is not None:
                 self.sharing.keep(index, where[number], sign[number], trace)
         return bounds

@@ -81,12 +81,12 @@ class ForwardPropagation:
 
             moves = moves + self.rounding.charge(k, sources, layer, charged, size, end)
             moves = moves + layer.spare([f.interval.size for f in charged])
-        extremes = self.rounding.groupings(k, sources, layer, sizes)
-        flushed = self.rounding.flushed(extremes, layer) if self.intermediate.in_float32 else 0.0
+        regrouped = self.rounding.regrouped_sizes(k, sources, layer, sizes)
+        flushed = self.rounding.flushed(regrouped, layer) if self.intermediate.in_float32 else 0.0
         moves = moves + flushed
         roundings = layer.row_terms + SPARE + max(self.network.readers[i] for i in sources)
         form = NodeForm.ranged(reference, moved[:, 0], moved[:, 1:], radius + moves, active)
-        self.intermediate.usable &= self.rounding.bounded(extremes).numpy()
+        self.intermediate.usable &= self.rounding.bounded(regrouped).numpy()
         tiny = torch.zeros((), dtype=torch.float64)
         for sized, shape in zip(charged, layer.input_shapes, strict=True):
             lost = int(np.prod(shape)) * (layer.row_terms + 2) * FLUSH
@@ -228,8 +228,8 @@ class ForwardPropagation:
         for f in (x, y):
             lost = int(np.prod(layer.shape)) * 2 * FLUSH
             self.intermediate.flush += lost * f.width.reshape(m, -1).amax(1).numpy()
-        extremes = self.rounding.multiplied(k, sources, [first.size, second.size])
-        self.intermediate.usable &= self.rounding.bounded(extremes).numpy()
+        regrouped = self.rounding.regrouped_product(k, sources, [first.size, second.size])
+        self.intermediate.usable &= self.rounding.bounded(regrouped).numpy()
         ends = torch.stack([u * v for u in first for v in second]) - reference
         room = room + OWN_FEW * (size + reference.abs())
         return self.intermediate.within(form, ends.amin(0) - room, ends.amax(0) + room)

@@ -45,21 +45,21 @@ def partial_sums(count: Tensor | int, peak: Tensor, squares: Tensor, end: Tensor
     number = torch.as_tensor(count, dtype=torch.float64)
     root = squares.sqrt() * UP
 
-    def ordered(leaves: Tensor) -> Tensor:
-        """The sum of what one to ``leaves`` numbers of one sign may be together."""
-        # the first few by their squares, the others by all of them
+    def largest(leaves: Tensor) -> Tensor:
+        """Return a bound of the sum, over n up to ``leaves``, of the magnitude of n numbers of one sign together."""
+        # for small n by the sum of squares (Cauchy-Schwarz), else by the sum of all
         few = torch.minimum(leaves, (peak / root).square().nan_to_num(nan=0.0, posinf=0.0).floor())
         return (2.0 / 3.0 * few * few.sqrt() + few.sqrt()) * root + (leaves - few) * peak
 
     half = (0.5 * (number + 1.0)).ceil()
-    least = torch.minimum(ordered(number + 1.0), 2.0 * ordered(half) + peak + half * end)
+    least = torch.minimum(largest(number + 1.0), 2.0 * largest(half) + peak + half * end)
     return torch.minimum(number * peak, least * UP)
 
 
-class Extremes(NamedTuple):
-    """Upper bounds [m] or [1] of numbers in programs that group the scales before a node in another way (N21).
+class RegroupedSizes(NamedTuple):
+    """Upper bounds [m] or [1] of magnitudes in programs that regroup the factors applied before a node (N21).
 
-    ``scales``: of products of scales alone, since the last layer of sums or activation; ``sums``: with one such layer.
+    ``scales``: for factors since the last activation or layer that mixes neurons; ``sums``: for earlier ones.
     """
 
     scales: Tensor
@@ -74,12 +74,14 @@ class Rounding:
         #: by node: roundings of its sums
         self.terms: dict[int, Tensor | int] = {}
         #: by linear node and product
-        self.extremes: dict[int, Extremes] = {}
+        self.regrouped: dict[int, RegroupedSizes] = {}
         #: by node, where a program may fold shifts into the next layer: their sizes together, one item (N21)
         self.shifts: dict[int, Tensor] = {}
 
-    def groupings(self, k: int, sources: tuple[int, ...], layer: LinearLayer, sizes: list[Tensor]) -> Extremes:
-        """Return `Extremes` of linear node k for inputs up to ``sizes`` [m or 1, *input_shapes[i]]; cached."""
+    def regrouped_sizes(
+        self, k: int, sources: tuple[int, ...], layer: LinearLayer, sizes: list[Tensor]
+    ) -> RegroupedSizes:
+        """Return `RegroupedSizes` of linear node k for inputs up to ``sizes`` [m or 1, *input_shapes[i]]; cached."""
         most = [size.flatten(1).amax(1) for size in sizes]
         before = [self._before(i, size) for i, size in zip(sources, most, strict=True)]
         scales = sum(e.scales + size + 1.0 for e, size in zip(before, most, strict=True))
@@ -93,34 +95,34 @@ class Rounding:
         else:
             scales, sums = layer.gain * scales, layer.gain * sums
         offset = 0.0 if layer.bias is None else float(layer.bias.abs().max())
-        extremes = self.extremes[k] = Extremes(scales + offset, sums + offset)
-        return extremes
+        regrouped = self.regrouped[k] = RegroupedSizes(scales + offset, sums + offset)
+        return regrouped
 
-    def multiplied(self, k: int, sources: tuple[int, ...], sizes: list[Tensor]) -> Extremes:
-        """Return `Extremes` of product node k: the scales of either factor may move to the other (N21)."""
+    def regrouped_product(self, k: int, sources: tuple[int, ...], sizes: list[Tensor]) -> RegroupedSizes:
+        """Return `RegroupedSizes` of product node k: the scales of either factor may move to the other (N21)."""
         most = [size.flatten(1).amax(1) for size in sizes]
         one, two = (self._before(i, size) for i, size in zip(sources, most, strict=True))
         scales = (one.scales + most[0] + 1.0) * (two.scales + most[1] + 1.0)
         sums = one.sums * (two.scales + most[1] + 1.0) + two.sums * (one.scales + most[0] + 1.0)
-        extremes = self.extremes[k] = Extremes(scales, sums)
-        return extremes
+        regrouped = self.regrouped[k] = RegroupedSizes(scales, sums)
+        return regrouped
 
-    def _before(self, index: int, like: Tensor) -> Extremes:
-        """Return `Extremes` of a node's input; positive scales pass through maxima."""
+    def _before(self, index: int, like: Tensor) -> RegroupedSizes:
+        """Return `RegroupedSizes` of a node's input; positive scales pass through maxima."""
         while index and isinstance(self.network.nodes[index - 1].layer, MaxPool):
             index = self.network.nodes[index - 1].inputs[0]
         zero = torch.zeros_like(like)
-        return self.extremes.get(index, Extremes(zero, zero))
+        return self.regrouped.get(index, RegroupedSizes(zero, zero))
 
     @staticmethod
-    def bounded(extremes: Extremes) -> Tensor:
+    def bounded(regrouped: RegroupedSizes) -> Tensor:
         """Return whether no grouping overflows, [m or 1] (N22)."""
-        return extremes.scales + extremes.sums < OVERFLOW
+        return regrouped.scales + regrouped.sums < OVERFLOW
 
     @staticmethod
-    def flushed(extremes: Extremes, layer: LinearLayer) -> Tensor:
+    def flushed(regrouped: RegroupedSizes, layer: LinearLayer) -> Tensor:
         """Return an upper bound [m or 1, 1, ...] of the error by flushing to zero, over all groupings (N21)."""
-        lost = FLUSHES * FLUSH * (extremes.scales + extremes.sums + layer.gain + 1.0) * MAGNITUDES_UP
+        lost = FLUSHES * FLUSH * (regrouped.scales + regrouped.sums + layer.gain + 1.0) * MAGNITUDES_UP
         return lost.reshape(-1, *[1] * len(layer.shape))
 
     def shifted(self, k: int, sources: tuple[int, ...], layer: LinearLayer) -> Tensor | float:

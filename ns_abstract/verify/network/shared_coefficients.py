@@ -24,14 +24,14 @@ from ns_abstract.verify.network.max_pooling import MaxPool
 from ns_abstract.verify.network.stopping import BackwardTrace
 from ns_abstract.verify.network.subnormals import subnormals_kept
 
-#: Largest images of which rows are kept: their sums' rounding must stay small. Most numbers of all nodes together for
-#: rows to be kept on the way; bytes of rows that are passed back together.
+#: Largest images whose coefficients are stored, as rounding of their sums must stay small; largest networks (neurons)
+#: whose coefficients are stored at every node; bytes of coefficients that are passed back together.
 _MOST_NUMBERS, _MOST_TRACED, _TOGETHER = 1 << 19, 1 << 16, 16 << 20
-#: Part of the memory that rows may take.
+#: Preference: share of the memory for stored coefficients.
 _ROWS_SHARE = 0.25
-#: Rows that are multiplied at a time: their absolute values should stay in a processor's cache.
+#: Preference: rows that are multiplied at a time; their absolute values should stay in a processor's cache.
 _ROWS_AT_ONCE = 256
-#: Part of a number's width by which it may miss being open for the first cell to pass back a row for it.
+#: Preference: the first cell also refines neurons that miss being unstable by this fraction of their width.
 _NEARLY = 0.25
 
 
@@ -125,7 +125,7 @@ class _ReferenceCell(CoefficientSource):
         self._keeps = size <= _MOST_NUMBERS
         if self._keeps:
             self.most_rows = max(16, _TOGETHER // self._by_row)
-        #: what all is relative to, by node, and what is followed at maxima
+        #: by node: the reference, and the inputs that lower planes of pooling windows follow
         self.references: dict[int, Tensor] = {}
         self.winners: dict[int, Tensor] = {}
         self.cells = NetworkBounds(network, images, memory, arithmetic, sharing=self)
@@ -142,7 +142,7 @@ class _ReferenceCell(CoefficientSource):
         self, index: int, form: NodeForm, unstable: Tensor, apart: Tensor | None, layer: Activation | None
     ) -> tuple[NodeForm, Tensor, Tensor | None]:
         if isinstance(layer, LeakyRelu):
-            # they may be open elsewhere
+            # they may be unstable in other cells
             lower, upper = form.interval
             near = _NEARLY * (upper - lower)
             unstable = (lower < near) & (upper > -near)
@@ -190,12 +190,12 @@ class _ReusingCells(CoefficientSource):
     ) -> None:
         self.first = first
         self._last = max(first.stored, default=0) if fresh else None
-        self._columns: dict[int, tuple[NDArray[np.float32], NDArray[np.float32]]] = {}
+        self._factors: dict[int, tuple[NDArray[np.float32], NDArray[np.float32]]] = {}
         self._count = images.count
         self.cells = NetworkBounds(first.network, images, memory, arithmetic, sharing=self)
 
     def about(self, middle: Float64) -> Float64:
-        # what rows gathered at maxima and products is relative to the first cell's references
+        # offsets that were summed at maxima and products are relative to the first cell's references
         return np.repeat(self.first.intermediate.middle, len(middle), axis=0)
 
     def reference(self, k: int, passed_on: Callable[[], Tensor]) -> Tensor:
@@ -216,15 +216,15 @@ class _ReusingCells(CoefficientSource):
         lines = self.first.intermediate.relaxations[0].lines[k]
         return lines[0, 0].reshape(shape), lines[3, 0].reshape(shape)
 
-    def _column(self, at: int) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-        """Return the factors [n, m k] of rows on the output of node ``at``, and those of their magnitudes [n, m l + 1].
+    def _node_factors(self, at: int) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+        """Return what coefficients on node ``at`` multiply [n, m k], and what their magnitudes multiply [n, m l + 1].
 
-        Columns of one kind are adjacent. On the image, rows have slopes [d], the middle and the interval's middle;
-        magnitudes have half the distances of planes and of intervals. At activations rows have slopes [d], middle and
-        half; magnitudes the same. At linear layers magnitudes have the rounding. The last column of magnitudes is that
-        of all terms.
+        Columns of one kind are adjacent. On the image, coefficients multiply slopes [d], the planes' middle and the
+        interval's middle; magnitudes half the distances of planes and of the interval's ends. At activations both
+        multiply slopes [d], middle and half-width; at linear layers magnitudes multiply the rounding. Magnitudes'
+        last column is the largest sum of all terms' sizes, for rounding.
         """
-        if at not in self._columns:
+        if at not in self._factors:
             intermediate = self.intermediate
             m, d = intermediate.count, intermediate.d
             signed: list[Float64] = []
@@ -254,22 +254,22 @@ class _ReusingCells(CoefficientSource):
             n = len(most)
             one, two = (np.reshape(v, (-1, n)).T for v in (signed, sized))
             two = np.concatenate([two, most[:, None]], axis=1)
-            self._columns[at] = one.astype(np.float32, order="C"), two.astype(np.float32, order="C")
-        return self._columns[at]
+            self._factors[at] = one.astype(np.float32, order="C"), two.astype(np.float32, order="C")
+        return self._factors[at]
 
-    def _said(self, index: int) -> _ReusedBounds:
-        """Return the bounds of node ``index`` in these cells by the first cell's rows."""
+    def _stored_bounds(self, index: int) -> _ReusedBounds:
+        """Return bounds of node ``index`` in these cells by the first cell's stored coefficients."""
         intermediate = self.intermediate
         m, d = intermediate.count, intermediate.d
         stored = self.first.stored[index]
         count = len(stored.flat)
-        # what intervals alone say has no slopes but those of what is between an activation's offsets
+        # bounds by intervals have no slopes but those between an activation's two offsets
         signed, tilted = np.zeros((count, d + 2, m)), np.zeros((count, d + 1, m))
         half, spread, lost = np.zeros((count, 2, m)), np.zeros((count, m)), np.zeros((count, m))
         for at, rows in stored.by_node.items():
             n = rows.shape[1]
             loses = gamma(n + 4)
-            one, two = self._column(at)
+            one, two = self._node_factors(at)
             tiny = n * FLUSH * (1.0 + float(np.abs(rows).max(initial=0.0)))
             for first in range(0, count, _ROWS_AT_ONCE):
                 part, here = rows[first : first + _ROWS_AT_ONCE], slice(first, first + _ROWS_AT_ONCE)
@@ -286,7 +286,7 @@ class _ReusingCells(CoefficientSource):
                     spread[here] += sizes[:, -1]
                 else:
                     spread[here] += sizes[:, 0]
-                # what float32 sums lose is relative to the products' sizes
+                # rounding of float32 sums is relative to the sizes of the products
                 lost[here] += loses / (1.0 - loses) * most
                 lost[here] += tiny * (d + 5)
         signed, tilted, half = (np.moveaxis(v, (1, 2), (0, 1)) for v in (signed, tilted, half))
@@ -295,7 +295,7 @@ class _ReusingCells(CoefficientSource):
         slopes, middle, moved = signed[:d] + tilts, signed[d] + gathered, signed[d + 1] + gathered
         low, high = stored.fixed.T
         if intermediate.rounds(index):
-            # what a row gathers where it starts
+            # rounding of the node itself
             lost += intermediate.relaxations[0].noise[index].reshape(m, -1).numpy()[:, stored.flat]
         spread = spread + 0.5 * (high - low) + lost + intermediate.flush[:, None]
         middle, moved = middle + 0.5 * (low + high), moved + 0.5 * (low + high)
@@ -313,22 +313,22 @@ class _ReusingCells(CoefficientSource):
     def reuse_bounds(
         self, index: int, form: NodeForm, unstable: Tensor, apart: Tensor | None, layer: Activation | None
     ) -> tuple[NodeForm, Tensor, Tensor | None]:
-        form = self._borrowed(index, form)
+        form = self._narrowed(index, form)
         if layer is not None:
             unstable, apart = layer.unstable(*form.interval), layer.relaxation_gap(*form.interval)
         if index in self.first.stored and index != self._last:
-            # rows of the cell's own for what has none
+            # neurons without stored coefficients get passes of their own
             bounded = torch.zeros(form.reference[0].numel(), dtype=torch.bool)
             bounded[torch.from_numpy(self.first.stored[index].flat)] = True
             unstable, apart = unstable & ~bounded.reshape(form.reference.shape[1:]), None
         return form, unstable, apart
 
-    def _borrowed(self, index: int, form: NodeForm) -> NodeForm:
-        """Return the form intersected with the bounds by the first cell's rows."""
+    def _narrowed(self, index: int, form: NodeForm) -> NodeForm:
+        """Return the form intersected with the bounds by the first cell's stored coefficients."""
         if index not in self.first.stored:
             return form
         flat, sign = self.first.stored[index].flat, self.first.stored[index].sign
-        slopes, middle, half, least, most = self._said(index)
+        slopes, middle, half, least, most = self._stored_bounds(index)
         m, d, shape = self.intermediate.count, self.intermediate.d, form.reference.shape
         lower, upper, c, r = (np.array(v.reshape(m, -1).numpy()) for v in (form.lower, form.upper, form.c, form.r))
         a = np.array(form.a.reshape(m, d, -1).numpy())

@@ -49,7 +49,7 @@ class SplitNeurons:
         """Return the same for some rows."""
         return replace(self, side=self.side[rows])
 
-    def pay(self, multiplier: Float32) -> tuple[Float32, Float64]:
+    def lagrangian_terms(self, multiplier: Float32) -> tuple[Float32, Float64]:
         """Return what multipliers [R, B] >= 0 add to rows: coefficients [R, B], and a lower bound [R] of the offset.
 
         A row is at least itself less ``multiplier * side * z``, as that product is not negative.
@@ -64,12 +64,12 @@ class SplitNeurons:
 class OptimisedSlopes:
     """The slopes and multipliers of a cell's rows, and the rows' coefficients, by node.
 
-    ``lines`` are as in `pass_activation`, with rows in place of cells; ``paid`` are positions and results of
-    `SplitNeurons.pay`; ``trace`` [R, C, H, W] are coefficients on the output, and on the image (0).
+    ``lines`` are as in `pass_activation`, with rows in place of cells; ``multiplier_terms``: positions and results of
+    `SplitNeurons.lagrangian_terms`; ``trace`` [R, C, H, W] are coefficients on the output, and on the image (0).
     """
 
     lines: dict[int, Float32]
-    paid: dict[int, tuple[Int64, Float32, Float64]] = field(default_factory=dict)
+    multiplier_terms: dict[int, tuple[Int64, Float32, Float64]] = field(default_factory=dict)
     trace: dict[int, Float32] = field(default_factory=dict)
 
     def keep(self, at: int, value: Float32, number: Int64, count: int) -> None:
@@ -151,7 +151,7 @@ class DualAscent:
                 else:
                     choice.put(parameter, lines)
         return OptimisedSlopes(
-            self._lines, {k: (held.flat, *held.pay(self.multipliers[k])) for k, held in self.split.items()}
+            self._lines, {k: (held.flat, *held.lagrangian_terms(self.multipliers[k])) for k, held in self.split.items()}
         )
 
     def climb(

@@ -12,20 +12,20 @@ from ns_abstract.verify.network.cost_model import (
 )
 from ns_abstract.verify.network.graph import Network
 
-#: Part of a node's numbers past which all of them are bounded by rows.
-_RENEW = 0.01
-#: Part of what is allowed that rows of one node may take whatever is open.
-_CHEAP = 0.03
-#: Part of widths that these have to leave at most.
-_WORTH = 0.1
-#: Widths, as a part of a node's numbers, that rows of dearer nodes need not improve.
-_ENOUGH = 0.03
-#: Parts of widths and of signs not found out past which rows are given up.
-_KEPT, _LOST = 0.9, 0.9
-#: Part of a node's numbers that have to be open for that to end all.
-_MOST = 0.5
-#: Ways that are tried.
-_TRIED = 6
+#: Preferences. Fraction of unstable neurons of a node past which all of its neurons are refined,
+_MANY_UNSTABLE = 0.01
+#: share of the budget that one node may always take,
+_SMALL_SHARE = 0.03
+#: fraction of widths below which a refinement of stable neurons pays,
+_NARROWED = 0.1
+#: width, relative to a node's magnitude, at which expensive passes may stop,
+_STOPPING_WIDTH = 0.03
+#: fractions of widths kept and of neurons still unstable past which a node is left as it is,
+_WIDTH_KEPT, _STILL_UNSTABLE = 0.9, 0.9
+#: fraction of unstable neurons past which later nodes are left, too,
+_HOPELESS_PART = 0.5
+#: and routes that are tried.
+_MOST_ROUTES = 6
 
 
 class WorkBudget:
@@ -37,81 +37,85 @@ class WorkBudget:
         self.deep = self.costs.deep
         self.planned = self.costs.planned
         self.left = PLANNED_PRODUCTS if self.planned else ALLOWED_PRODUCTS
-        self._bounded = dict(self.costs.bounded) if self.planned else {}
-        self._spread: list[float] = []
+        self._counts = dict(self.costs.refined_counts) if self.planned else {}
+        self._widths: list[float] = []
         self._size = 1.0
         self._step: int | None = None
 
     @property
-    def rests(self) -> set[int]:
+    def end_nodes(self) -> set[int]:
         """Nodes on whose bounds passes from later nodes may end."""
-        return self.costs.rests if self.planned else set()
+        return self.costs.end_nodes if self.planned else set()
 
-    def learns(self, index: int, radius: float, size: float) -> None:
-        """Record the width of the forms of node ``index``, the next or an earlier one (N1), and its magnitude."""
-        self._spread[index:] = [radius, *self._spread[index + 1 :]]
+    def record_width(self, index: int, radius: float, size: float) -> None:
+        """Record the mean radius of the form of node ``index``, the next or an earlier one (N1), and its magnitude."""
+        self._widths[index:] = [radius, *self._widths[index + 1 :]]
         self._size = size or self._size
 
-    def ways(self, index: int, count: int) -> tuple[list[BackwardRoute], float]:
-        """Return routes for ``count`` rows of node ``index`` that are worth a trial, and the price of a product (N18).
+    def routes(self, index: int, count: int) -> tuple[list[BackwardRoute], float]:
+        """Return routes worth a trial for ``count`` neurons of node ``index``, and the price of a multiplication (N18).
 
-        There are none if the form of the node is as tight, or the bounds of the outputs will be useless.
+        There are none if the plan leaves the node as it is, or predicts useless bounds.
         """
-        self._bounded[index] = float(count)
-        plan = self.costs.plan(max(self.left, 1.0), self._spread[:index], self._size, self._bounded, self._step)
+        self._counts[index] = float(count)
+        plan = self.costs.plan(max(self.left, 1.0), self._widths[:index], self._size, self._counts, self._step)
         self._step = plan.step
         if plan.widest > HOPELESS_WIDTH * self._size:
             self.left = 0.0
-        if index not in plan.ways:
+        if index not in plan.routes:
             return [], plan.rate
-        ways = [way for way in self.costs.ways(index) if count * way.price <= self.left]
-        ways.sort(key=lambda way: log_or_least(way.spread(self._spread, self._size)) + plan.rate * count * way.price)
-        return ways[:_TRIED], plan.rate
+        routes = [route for route in self.costs.routes(index) if count * route.price <= self.left]
+        routes.sort(
+            key=lambda route: (
+                log_or_least(route.predicted_width(self._widths, self._size)) + plan.rate * count * route.price
+            )
+        )
+        return routes[:_MOST_ROUTES], plan.rate
 
-    def nearest(self, index: int, count: int) -> BackwardRoute | None:
-        """Return the longest affordable route of ``count`` rows of node ``index``, and spend its multiplications."""
+    def longest_affordable(self, index: int, count: int) -> BackwardRoute | None:
+        """Return the longest affordable route of ``count`` neurons of node ``index``, and spend its multiplications."""
         best = None
-        for way in self.costs.ways(index):
-            if count * way.price < _CHEAP * self.left:
-                best = way
+        for route in self.costs.routes(index):
+            if count * route.price < _SMALL_SHARE * self.left:
+                best = route
         if best is not None:
             self.left -= count * best.price
         return best
 
-    def renews(self, part: float, products: float) -> bool:
-        """Return whether all numbers of a node are refined for ``products`` if the fraction ``part`` is unstable."""
-        return part > _RENEW or products < self._cheap
+    def refines_all(self, part: float, products: float) -> bool:
+        """Return whether all neurons of a node are refined, for ``products``, if the fraction ``part`` is unstable."""
+        return part > _MANY_UNSTABLE or products < self._small_amount
 
     @property
-    def _cheap(self) -> float:
+    def _small_amount(self) -> float:
         """Multiplications that are spent on one node in any case: fewer where not all passes are affordable."""
-        return _CHEAP * ALLOWED_PRODUCTS * min(1.0, ALLOWED_PRODUCTS / self.costs.total)
+        return _SMALL_SHARE * ALLOWED_PRODUCTS * min(1.0, ALLOWED_PRODUCTS / self.costs.total)
 
-    def suffices(self, products: float) -> float:
-        """Return the width, relative to a node's numbers, at which rows for all of them may stop early (N17)."""
-        return 0.0 if products < self._cheap else _ENOUGH
+    def stopping_width(self, products: float) -> float:
+        """Return the width, relative to a node's magnitude, at which passes for all neurons may stop early (N17)."""
+        return 0.0 if products < self._small_amount else _STOPPING_WIDTH
 
-    def takes(self, products: float) -> bool:
+    def spend(self, products: float) -> bool:
         """Spend ``products`` multiplications and return True if so many are left."""
         if products > self.left:
             return False
         self.left -= products
         return True
 
-    def spares(self, products: float) -> None:
+    def refund(self, products: float) -> None:
         """Give back ``products`` multiplications that were not used."""
         self.left += products
 
-    def gains(self, width_left: float, part: float) -> bool:
-        """Return whether passes pay that leave the fraction ``width_left`` of widths, if ``part`` is unstable."""
-        return part > _RENEW or width_left < _WORTH
+    def pays(self, width_left: float, part: float) -> bool:
+        """Return whether refining all neurons pays, if it leaves ``width_left`` of widths and ``part`` is unstable."""
+        return part > _MANY_UNSTABLE or width_left < _NARROWED
 
-    def vain(self, width_left: float, unstable: float, part: float) -> bool:
-        """Return whether to leave a node as it is, as passes leave too large a fraction of widths or of open signs.
+    def is_futile(self, width_left: float, unstable: float, part: float) -> bool:
+        """Return whether refining a node is futile: it leaves too large a fraction of widths, or of neurons unstable.
 
-        If the fraction ``part`` of its numbers that are unstable is large, later nodes are given up, too.
+        If the fraction ``part`` of its neurons that are unstable is large, the rest of the budget is given up, too.
         """
-        hopeless = width_left > _KEPT or unstable > _LOST
-        if hopeless and part > _MOST:
+        hopeless = width_left > _WIDTH_KEPT or unstable > _STILL_UNSTABLE
+        if hopeless and part > _HOPELESS_PART:
             self.left = 0.0
         return hopeless
