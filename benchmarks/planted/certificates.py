@@ -281,7 +281,8 @@ CERTIFICATES = (
     ),
     Fault(
         "branching: multipliers forget the reference",
-        _SLOPES, "SplitNeurons.lagrangian_terms", "gained.astype(np.float64) @ self.reference - room", "-room", _BRANCHES,
+        _SLOPES, "SplitNeurons.lagrangian_terms", "gained.astype(np.float64) @ self.reference - room", "-room",
+        _BRANCHES,
     ),
     Fault(
         "branching: the margin is that of the last group",

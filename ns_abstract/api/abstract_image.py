@@ -67,7 +67,7 @@ class BoundResult:
 
     @classmethod
     def of(cls, frame: FrameResult, **more: Any) -> BoundResult:
-        """The result of one frame; ``more`` are the attributes that a frame does not have."""
+        """Return the result of one frame; ``more`` are the attributes that a frame does not have."""
         same = {f.name for f in fields(cls)} & {f.name for f in fields(FrameResult)} - {"cells"}
         return cls(
             **{name: getattr(frame, name) for name in same},
@@ -127,7 +127,7 @@ class BoundResult:
         return "done" if ratio_is_met or not self.parameters.dimensions else "partial"
 
     def linear(self, box: Mapping[str, tuple[float, float]] | ParameterBox | None = None) -> LinearImage:
-        """Linear bounds of the whole picture over the set or a part of it, one map for all cells.
+        """Return the linear bounds of the whole picture over the set or a part of it, one map for all cells.
 
         Args:
             box: Ranges (low, high) by name, in the units of ``parameters``; what is not named stays whole. None: the
@@ -145,7 +145,7 @@ class BoundResult:
         return linear_image(self.cells, self.lower, self.upper, sub_box(self.parameters, box))
 
     def at(self, p: Mapping[str, float] | Sequence[float]) -> tuple[np.ndarray, np.ndarray]:
-        """Bounds of the picture at one pose of the set, float32 [H, W, 3] each; those of the set without kept cells.
+        """Return bounds of the picture at one pose, float32 [H, W, 3] each; those of the whole set without kept cells.
 
         Args:
             p: Values by name, or in the order of ``parameters``, in their units.
@@ -156,7 +156,7 @@ class BoundResult:
         return bounds_at(self.cells, self.lower, self.upper, point_of(self.parameters, p))
 
     def to_torch(self) -> Any:
-        """The first layer for a verifier of networks; see `ns_abstract.refine.linear_map.LinearImage.to_torch`.
+        """Return the first layer for a verifier of networks; see `ns_abstract.refine.linear_map.LinearImage.to_torch`.
 
         Raises:
             InputError: The cells were not kept.
@@ -195,7 +195,7 @@ class BoundResult:
 
 
 def sub_box(whole: ParameterBox, given: Any) -> ParameterBox:
-    """The part of a set that ``given`` names: a box, or ranges (low, high) by name; None: the whole set.
+    """Return the part of a set that ``given`` names: a box, or ranges (low, high) by name; None: the whole set.
 
     Raises:
         InputError: It names other parameters, or reaches out of the set.
@@ -222,7 +222,7 @@ def sub_box(whole: ParameterBox, given: Any) -> ParameterBox:
 
 
 def point_of(whole: ParameterBox, values: Any) -> NDArray[np.float64]:
-    """Values [d] of a pose of the set, from numbers in the order of the parameters or by name.
+    """Return values [d] of a pose of the set, from numbers in the order of the parameters or by name.
 
     Raises:
         InputError: They are none, or outside of the set.

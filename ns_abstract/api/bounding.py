@@ -124,7 +124,7 @@ def bound_part(
 
 
 def local_workers(job: Job) -> int:
-    """Processes of a cluster on this machine: as many as there are cores and the scene fits into memory."""
+    """Return the number of cluster processes for this machine: as many as there are cores and fit into its memory."""
     cores = len(os.sched_getaffinity(0))
     return next((n for n in range(cores, 1, -1) if 2 * n * job.base_memory(n) <= job.memory), 1)
 
@@ -287,7 +287,7 @@ def _goal(job: Job, part: TileTask, target_ratio: float, leaf_bytes: int) -> Ref
 
 
 def _leaf_bytes(job: Job, processes: int) -> int:
-    """Bytes for the leaves of all processes on one machine together."""
+    """Return bytes for the leaves of all processes on one machine together."""
     needed = processes * job.base_memory(processes)
     if job.memory_limit is not None and needed > job.memory:
         raise InputError(
@@ -368,7 +368,7 @@ def bound(
 def bound_alone(
     job: Job, budget: float, on_progress: OnProgress | None, target_ratio: float, keep_leaves: bool = False
 ) -> tuple[FrameResult, str, bool]:
-    """The result of a job's only frame, its guarantee, and whether Ctrl-C or ``on_progress`` ended the work.
+    """Return the result of a job's only frame, its guarantee, and whether Ctrl-C or ``on_progress`` ended the work.
 
     Raises:
         InputError: The time is over before the first render.
@@ -388,7 +388,7 @@ def bound_alone(
 
 
 def listener(stop: StopRequest, on_progress: Callable[[Any], object] | None) -> Callable[[Any], None]:
-    """``on_progress`` as the work calls it: where it returns False or is interrupted, the work is asked to stop.
+    """Return a function that calls ``on_progress``, and requests a stop if it returns False or is interrupted.
 
     Raises:
         InputError: It cannot be called.

@@ -118,7 +118,7 @@ class CertificateReport:
         return None if elements is None else SceneDrawing(elements)
 
     def _kept_image(self, frame: int, pose: np.ndarray) -> np.ndarray | None:
-        """The stored image of a counterexample."""
+        """Return the stored image of a counterexample."""
         files = sorted((self.search.folder / IMAGES).glob(f"frame_{frame:05d}_*.npz"))
         return next((image for file in files if (image := _image_at(file, pose)) is not None), None)
 
@@ -190,7 +190,7 @@ class CertificateReport:
         return pictures
 
     def _drawn(self, frame: int, values: Sequence[float], side: int) -> bytes:
-        """PNG of the picture at parameter values in the order of all parameters.
+        """Return the PNG of the picture at parameter values in the order of all parameters.
 
         Raises:
             WorkCancelledError: There is no time for more pictures.
@@ -220,7 +220,7 @@ class CertificateReport:
 
 
 def _image_at(file: Path, pose: np.ndarray) -> np.ndarray | None:
-    """[H, W, 3] image of a stored counterexample; None if the file is unreadable, malformed or of another pose."""
+    """Return the [H, W, 3] image of a stored counterexample; None if the file is unreadable or of another pose."""
     try:
         with open_archive(file, "counterexample", "") as stored:
             shape, kind = stored.declared["image"]
@@ -233,12 +233,12 @@ def _image_at(file: Path, pose: np.ndarray) -> np.ndarray | None:
 
 
 def _depth(row: Mapping[str, Any]) -> float:
-    """Key that sorts falsified cells, worst first: the margin, or -inf where no margin is stored."""
+    """Return the key that sorts falsified cells, worst first: the margin, or -inf where no margin is stored."""
     return -np.inf if row["margin"] is None else row["margin"]
 
 
 def _worst(rows: list[dict[str, Any]]) -> list[dict[str, Any]]:
-    """Rows of falsified cells by rising margin; only the worst of those that share a counterexample is kept."""
+    """Return rows of falsified cells by rising margin; only the worst of those that share a counterexample is kept."""
     broken = sorted((row for row in rows if row["verdict"] == "falsified"), key=_depth)
     return list({tuple(row["counterexample"]): row for row in reversed(broken)}.values())[::-1]
 
@@ -253,7 +253,7 @@ class PoseRenderer:
         self._claims: dict[int, Claim] = {}
 
     def image(self, frame: int, values: Sequence[float]) -> tuple[FramePictures, np.ndarray, np.ndarray]:
-        """The frame's pictures, its own parameters of ``values`` of all parameters, and the picture there."""
+        """Return frame's pictures, the frame's own entries of ``values`` (of all parameters), and the picture there."""
         if frame not in self._frames:
             self._frames[frame] = self.job.pictures(frame)
         pictures = self._frames[frame]
@@ -294,7 +294,7 @@ class PoseRenderer:
 def look_closer(
     looks: PoseRenderer, entries: Sequence[Mapping[str, Any]], rows: CellRows, over: Callable[[], bool]
 ) -> CertificateDetails:
-    """Regions where the property fails, and poses along the sets, with pictures.
+    """Return regions where the property fails, and poses along the sets, with pictures.
 
     ``over``: whether no more pictures are to be rendered; `SECONDS` from now none are, either.
     """

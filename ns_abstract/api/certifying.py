@@ -51,7 +51,7 @@ _LAST = 5.0
 
 
 def network_memory(limit: float | None, workers: int) -> int:
-    """Bytes for the network's bounds of one of ``workers`` processes; ``limit`` in GiB for all, or None."""
+    """Return bytes for the network's bounds of one of ``workers`` processes; ``limit`` in GiB for all, or None."""
     # half: images and torch need room beside the bounds; a power of two, so that it hardly depends on the moment
     return min(MEMORY, 1 << int(np.log2(max(2.0, 0.5 * allowed_memory(limit) / workers))))
 
@@ -288,7 +288,7 @@ def certify(
 
 
 def certificate(job: Certification, rows: Mapping[int, list[Row]], document: Mapping[str, Any]) -> Certificate:
-    """The result of a search that has ended with these rows of cells by frame."""
+    """Return the result of a search that has ended with these rows of cells by frame."""
     covered = coverage(document["frames"])
     return Certificate.of(
         job.job.parameters,

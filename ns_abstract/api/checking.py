@@ -89,7 +89,7 @@ def check(
     loop: str | os.PathLike[str] | None = None,
     on_progress: Callable[[Audit], object] | None = None,
 ) -> Audit:
-    """Numbers of claims of a result that were proved, refuted and left open by a second program.
+    """Return numbers of claims of a result that were proved, refuted and left open by a second program.
 
     Args:
         output_dir: Output folder of ``ns-abstract-render --save-cells``, ``ns-abstract-certify`` or
@@ -148,7 +148,7 @@ def check(
 
 
 def least_part(proved: int, count: int, level: float = 0.95) -> float:
-    """Clopper and Pearson's lower limit of the part of all claims that holds: ``proved`` of ``count`` drawn ones do."""
+    """Return Clopper and Pearson's lower limit of the part of all claims that holds: ``proved`` of ``count`` do."""
     low, high = 0.0, float(proved > 0)
     for _ in range(60):
         p = 0.5 * (low + high)

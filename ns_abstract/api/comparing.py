@@ -142,7 +142,7 @@ class ComparisonJob(Job):
         return replace(work.run(), problems=platform_problems())
 
     def pictures(self, index: int, pose: Sequence[float]) -> tuple[np.ndarray, np.ndarray]:
-        """[H, W, 3] pictures of A and B at parameter values [d] of a frame's set."""
+        """Return [H, W, 3] pictures of A and B at parameter values [d] of a frame's set."""
         frame = self.frame(index)
         first, second = (assemble(f.render(np.array(pose)), frame.camera)[..., :3] for f in frame.both)
         return first, second
@@ -173,7 +173,7 @@ class ComparisonJob(Job):
 
 @contextmanager
 def _named(other: Scene) -> Iterator[None]:
-    """Context that adds B's file to any InputError raised inside."""
+    """Return a context that adds B's file to any InputError raised inside."""
     try:
         yield
     except InputError as error:
@@ -216,7 +216,7 @@ def _same_frame(first: DataparserTransform, second: DataparserTransform) -> bool
 
 
 def _frame_choice(scene: Scene, other: Scene) -> Assumption:
-    """The assumption that scenes A and B share one world frame, and its evidence: equal transforms, or the default."""
+    """Return the assumption that scenes A and B share one world frame: equal transforms, or the default."""
     if scene.run_frame is not None and other.run_frame is not None:
         return Assumption("frame of the other scene", "A's", "equal dataparser_transforms.json")
     without = [name for name, s in (("A", scene), ("B", other)) if s.run_frame is None]

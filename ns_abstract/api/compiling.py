@@ -50,7 +50,7 @@ def missing(frame: Frame) -> list[str]:
 
 
 def _progress(parts: Sequence[Sequence[str]]) -> CompileProgress:
-    """The progress of stages that are compiled side by side."""
+    """Return the progress of stages that are compiled side by side."""
     measured = [[_MEASURED.get(stage, _UNMEASURED) for stage in part] for part in parts]
     functions = sum(count for part in measured for count, _ in part)
     return CompileProgress(functions, max(sum(seconds for _, seconds in part) for part in measured), _PACE)
@@ -103,7 +103,7 @@ def _end(worker: subprocess.Popen[bytes]) -> None:
 
 
 def _latest(line: Connection, before: int) -> int:
-    """The newest number waiting on ``line``, without blocking; ``before`` if there is none or it is closed."""
+    """Return the newest number waiting on ``line``, without blocking; ``before`` if there is none or it is closed."""
     with suppress(EOFError, OSError):
         while line.poll():
             before = int(line.recv())

@@ -68,7 +68,7 @@ def _cameras(job: PathJob, frames: Sequence[int]) -> Iterator[str]:
 
 
 def _sets(job: PathJob, frames: Sequence[int]) -> Iterator[str]:
-    """Ranges of the frames' sets, the image motion of each parameter, and doubts about the units."""
+    """Return ranges of the frames' sets, the image motion of each parameter, and doubts about the units."""
     units = ShownUnits.of(job.describe())
     frames_by_text: dict[tuple[str, ...], list[int]] = {}
     for index in frames:

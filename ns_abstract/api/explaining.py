@@ -105,13 +105,13 @@ def explain(job: Job, index: int, result: FrameResult, seed: int = 0) -> Explana
 
 
 def _extent(frame: Frame, tile: int) -> tuple[int, int, int, int]:
-    """Pixels of a tile: first row, row after the last, first column, column after the last; clipped to the picture."""
+    """Return the pixels of a tile: first row, row after the last, first column, column after the last; clipped."""
     row, column = (frame.side * n for n in divmod(tile, frame.across))
     return row, min(row + frame.side, frame.camera.height), column, min(column + frame.side, frame.camera.width)
 
 
 def _tile_sum(frame: Frame, values: np.ndarray, tile: int) -> float:
-    """Sum (not the mean) of ``values`` [H, W, ...] over the pixels of a tile."""
+    """Return the sum (not the mean) of ``values`` [H, W, ...] over the pixels of a tile."""
     top, bottom, left, right = _extent(frame, tile)
     return float(values[top:bottom, left:right].sum())
 
@@ -119,7 +119,7 @@ def _tile_sum(frame: Frame, values: np.ndarray, tile: int) -> float:
 def _chosen(
     frame: Frame, leaves: Leaves, excess: np.ndarray, rng: np.random.Generator
 ) -> list[tuple[ParameterBox, int]]:
-    """Leaves of tiles drawn by their ``excess``, all where there are few."""
+    """Return leaves drawn at random by the ``excess`` of their tiles, or all of them where there are few."""
     numbers = leaves.tile[:, 0] // frame.side * frame.across + leaves.tile[:, 1] // frame.side
     weights = np.maximum(excess[numbers], 0.0)
     weights = weights / np.bincount(numbers, minlength=excess.size)[numbers]

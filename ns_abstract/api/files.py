@@ -50,7 +50,7 @@ class Settings:
         return SceneSource(self.load_config, self.program, self.overrides)
 
     def job_options(self, pose_sets: Sequence[PoseBox], path: CameraPath) -> dict[str, Any]:
-        """Options of `Job` for the sets of a path."""
+        """Return options of `Job` for the sets of a path."""
         return {
             "arithmetic": self.arithmetic,
             "seed": self.seed,
@@ -92,7 +92,7 @@ class PathJob(Job):
 
 
 def pose_set(path: CameraPath, index: int, perturbation: Perturbation) -> PoseBox:
-    """The poses of ``perturbation`` around entry ``index`` of a path.
+    """Return the poses of ``perturbation`` around entry ``index`` of a path.
 
     Raises:
         InputError: The path cannot be swept as asked.
@@ -133,7 +133,7 @@ def path_sets(
     perturbation: Perturbation | None = None,
     default: Perturbation | None = None,
 ) -> tuple[PoseBox, ...]:
-    """The sets of poses of a path's entries; arguments and errors as for `open_job`."""
+    """Return the sets of poses of a path's entries; arguments and errors as for `open_job`."""
     perturbations = (perturbation,) * len(path.cameras)
     if perturbation is None:
         perturbations = _perturbations(settings, scene.method(settings.arithmetic).dataset_scale, path, default)
@@ -170,7 +170,7 @@ def _perturbations(
 
 
 def resized(poses: PoseBox, height: int, width: int) -> PoseBox:
-    """The same poses with pictures of another size; see `PinholeCamera.resized`."""
+    """Return the same poses with pictures of another size; see `PinholeCamera.resized`."""
     target = poses.target_camera
     return replace(
         poses,

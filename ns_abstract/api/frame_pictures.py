@@ -76,7 +76,7 @@ class PropertySource:
         return Path() if self.file is None else self.file.parent
 
     def absolute(self) -> PropertySource:
-        """The same source with an absolute path, for a process with another working directory."""
+        """Return the same source with an absolute path, for a process with another working directory."""
         return PropertySource(self.value, (self.file or Path("property")).absolute())
 
     def within(self, error: InputError) -> InputError:
@@ -149,9 +149,9 @@ class FramePictures(ScenePictures):
         return self.frame, self.frame.tile_count
 
     def completed(self, image: np.ndarray, values: np.ndarray) -> np.ndarray:
-        """An `image` at parameter values [d] with its colours, where the search leaves them out."""
+        """Return an `image` at parameter values [d] with its colours, where the search leaves them out."""
         return image
 
     def shown(self, image: np.ndarray, values: np.ndarray) -> np.ndarray:
-        """An `image` at parameter values [d] as bytes [h, w, 3], for people."""
+        """Return an `image` at parameter values [d] as bytes [h, w, 3], for people."""
         return to_bytes(image)

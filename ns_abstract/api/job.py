@@ -140,7 +140,7 @@ class Job:
         return allowed_memory(self.memory_limit)
 
     def base_memory(self, processes: int = 1) -> int:
-        """Bytes that each of ``processes`` on one machine, which share its threads, needs beside the leaves."""
+        """Return bytes that each of ``processes`` on one machine, which share its threads, needs beside the leaves."""
         pixels = max(poses.camera.width * poses.camera.height for poses in self.pose_sets)
         return self.method.memory(pixels, max(1, most_threads() // processes))
 
@@ -160,17 +160,17 @@ class Job:
             )
 
     def leaf_bytes(self, processes: int) -> int:
-        """Bytes for the leaves that ``processes`` on one machine may have together."""
+        """Return bytes for the leaves that ``processes`` on one machine may have together."""
         return max(processes * _LEAST_LEAF_BYTES, (self.memory - processes * self.base_memory(processes)) // 2)
 
     # ---------------------------------------------------------------- frames
 
     def goal(self, ratio: float, seconds: float, cells: int | None = None) -> RefinementGoal:
-        """The goal with the memory that is left for leaves."""
+        """Return a goal of refinement whose leaves may take the remaining memory."""
         return RefinementGoal(ratio, seconds, cells, self.leaf_bytes(1))
 
     def frame(self, index: int, sheared: bool = False) -> Frame:
-        """Frame ``index``, ready for refinement; see `Method.frame`."""
+        """Return the frame ``index``, ready for refinement; see `Method.frame`."""
         return self.method.frame(self.pose_sets[index], sheared, bool(self.layers))
 
     def warm_up(self, index: int) -> None:
@@ -234,7 +234,7 @@ class Job:
         return replace(refinement.run_part(), problems=platform_problems())
 
     def joined(self, parts: Sequence[PartResult]) -> FrameResult:
-        """The frame that parts make up, with what was left out for it.
+        """Return the frame that parts make up, with the sentences on what was left out for it.
 
         Raises:
             ValueError: Tiles are missing or there twice.
@@ -294,7 +294,7 @@ class Job:
         return {**computed_by(), **self.method.fingerprint, **more, "poses": sets.hexdigest()}
 
     def describe(self) -> dict[str, Any]:
-        """The scene for reports, and the units that its sets were stated in."""
+        """Return a record of the scene for reports, with the units that its sets were stated in."""
         about, first = self.method.describe(), self.pose_sets[0].perturbation
         units = ShownUnits(first.units, first.angle_units, self.method.dataset_scale or 1.0)
         notes = [*about.get("notes", ()), *self.notes]
@@ -302,7 +302,7 @@ class Job:
 
 
 def _wide_turns(sets: Sequence[Perturbation]) -> Iterator[str]:
-    """A sentence on rotations stated in radians that are wide enough to have been meant in degrees, or none."""
+    """Return a sentence on rotations stated in radians that are wide enough to have been meant in degrees, or none."""
     widest: dict[str, float] = {}
     for entry in sets:
         for name, ends in entry.rotation.items() if entry.angle_units == "radians" else ():
@@ -317,7 +317,7 @@ def _wide_turns(sets: Sequence[Perturbation]) -> Iterator[str]:
 
 
 def _tiny_pictures(cameras: Sequence[PinholeCamera]) -> Iterator[str]:
-    """A sentence on pictures of one pixel, or none."""
+    """Return a sentence on pictures of one pixel, or none."""
     count = sum(camera.width * camera.height == 1 for camera in cameras)
     if count:
         frames = f"the picture of {count} of {len(cameras)} frames"
@@ -358,7 +358,7 @@ def warm_up_sub_boxes(frame: SubBoxFrame) -> None:
 
 
 def check_frames(frames: Sequence[int] | None, count: int) -> tuple[int, ...]:
-    """The frames asked for, each once, in order. Raises InputError where a number is not an entry of the path."""
+    """Return frames asked for, each once, in order. Raises InputError where a number is not an entry of the path."""
     if not frames:
         return tuple(range(count))
     for frame in frames:

@@ -122,7 +122,7 @@ class LocationQuestion(CellQuestion[LocateProgress]):
         return LocateProgress(left, min(best, default=None), store.seconds, done)
 
     def _excess(self, frame: int) -> float:
-        """Volume of the box that is searched for pose set ``frame``, divided by the volume of the set's own box."""
+        """Return the volume of the searched box of pose set ``frame``, divided by that of the set's own box."""
         searched, own = self.sets[frame], self.job.job.pose_sets[frame].box
         return float(np.prod(np.subtract(searched.upper, searched.lower) / np.subtract(own.upper, own.lower)))
 
@@ -159,7 +159,7 @@ class LocationQuestion(CellQuestion[LocateProgress]):
 
 
 def _more(job: Location) -> dict[str, Any]:
-    """Entries of report.json: `brightness` unless it is fixed, and `calibration` if there was one."""
+    """Return entries of report.json: `brightness` unless it is fixed, and `calibration` if there was one."""
     brightness = job.photo.brightness
     more: dict[str, Any] = {} if brightness.still else {"brightness": vars(brightness)}
     return more if job.calibration is None else {**more, "calibration": job.calibration.describe()}
@@ -278,12 +278,12 @@ def locate(
 
 
 def _ends(value: Any) -> Any:
-    """``value`` as (nested) lists if it is an array, for JSON; any other value unchanged."""
+    """Return ``value`` as (nested) lists if it is an array, for JSON; any other value unchanged."""
     return value.tolist() if isinstance(value, np.ndarray) else value
 
 
 def photo_levels(photo: ArrayLike) -> np.ndarray:
-    """[H, W, 3] uint8 levels of a photo. Raises InputError where it is none, or holds other numbers than k/255."""
+    """Return the [H, W, 3] uint8 levels of a photo. Raises InputError where a number is not k/255."""
     values = array_of(photo)
     if values is None:
         raise unusable(photo, field="photo", fix="give [H, W, 3] uint8, or numbers in [0, 1]")
@@ -319,7 +319,7 @@ def _checked_mask(mask: ArrayLike, job: Job) -> np.ndarray:
 
 
 def located(job: Location, rows: Mapping[int, list[Row]], document: Mapping[str, Any]) -> Located:
-    """The result of a search that has ended with these rows of cells by frame."""
+    """Return the result of a search that has ended with these rows of cells by frame."""
     hull = document["hull"]
     return Located.of(
         job.job.parameters,

@@ -129,7 +129,7 @@ class Location:
         return self.search(number).examine(cells)
 
     def picture(self, number: int, values: np.ndarray) -> np.ndarray:
-        """[H, W, 3] picture at parameters of a frame's set."""
+        """Return [H, W, 3] picture at parameters of a frame's set."""
         plain = self.search(number).plain
         return assemble(plain.render(np.asarray(values, np.float64)), plain.camera)[..., :3]
 
@@ -141,7 +141,7 @@ class Location:
         return min(1.0, self._sheared(number, boxes).volume_within(plain) / whole)
 
     def cover(self, number: int, cells: list[Cell], late: Callable[[], bool] = lambda: False) -> PoseCover:
-        """Cells of a set's own parameters that hold all poses in ``cells`` of its search; ``late``: see `cover`."""
+        """Return cells of a set's own parameters that hold all poses in ``cells`` of its search; see `cover`."""
         search = self.search(number)
         boxes = []
         for box in map(search.grid.box_of, cells):
@@ -305,13 +305,13 @@ def calibrate(
 
 
 def _noise(residuals: np.ndarray, part: float) -> float:
-    """Noise, rounded up to 1e-4, that ``residuals`` [n] (largest first) stay within, but for a fraction ``part``."""
+    """Return the noise, rounded up to 1e-4, that all but a fraction ``part`` of the ``residuals`` [n] stay within."""
     allowed = math.floor(part * residuals.size)
     return 0.0 if allowed >= residuals.size else math.ceil(float(residuals[allowed]) * 1e4) / 1e4
 
 
 def training_data(scene: Scene) -> Path:
-    """The ``transforms.json`` of the data set that a run was trained on.
+    """Return the ``transforms.json`` of the data set that a run was trained on.
 
     It is looked for where config.yml says, and under the ends of that path beside config.yml and above it. Raises
     InputError where the scene is no run, or nothing is there.

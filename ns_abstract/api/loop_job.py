@@ -78,7 +78,7 @@ class LoopJob:
         return TubeBuilder(self.loop, view, ControlBounds(self.model, self.loop.control), dependence, views=self._seen)
 
     def _views(self, poses: PoseBox) -> tuple[PropertyView, ...]:
-        """Views by which the loop's picture properties are evaluated over the poses of a set, one per property.
+        """Return views by which the loop's picture properties are evaluated over the poses of a set, one per property.
 
         Raises:
             InputError: A selection picks nothing, or a region reaches beyond the picture.
@@ -125,7 +125,7 @@ class LoopJob:
         return replace(self.reacher(), view=view)
 
     def prover(self, kind: VariationKind) -> ProveCell:
-        """Bounds and attacks cells for all scenes around the stored one (V13)."""
+        """Return a function that bounds and attacks cells for all scenes around the stored one (V13)."""
 
         # radii come one after the other
         @lru_cache(1)
@@ -214,7 +214,7 @@ def open_loop(
 
 
 def _seen(scene: Scene, loop: Loop, size: tuple[int, int], arithmetic: str | None) -> Job:
-    """The scene with the poses of the loop's camera. Raises InputError: loops are not for this scene."""
+    """Return a job of the scene and the poses of the loop's camera. Raises InputError: loops are not for this scene."""
     poses = loop.camera.poses(size)
     origin = "the network's input" if loop.preprocess.resize is None else "loop file: preprocess.resize"
     job = Job(scene, [poses], arithmetic=arithmetic, set_choices=set_choices([poses], origin, "loop file: camera"))

@@ -201,7 +201,7 @@ def verdict(entries: Mapping[str, Mapping[str, Any]]) -> str:
 
 
 def shown_tube(job: LoopJob, lower: list[float], upper: list[float], runs: int) -> dict[str, Any]:
-    """A tube beside the hull of simulated runs, and its widths with less dependence.
+    """Return a tube beside the hull of simulated runs, and its widths with less dependence.
 
     Args:
         lower, upper: [m] the cell.
@@ -235,5 +235,5 @@ def shown_tube(job: LoopJob, lower: list[float], upper: list[float], runs: int) 
 
 
 def widths(tube: Tube) -> list[float]:
-    """By step, the mean over the states of a tube's width; as far as the tube goes."""
+    """Return, by step, the mean over the states of a tube's width, as far as the tube goes."""
     return [float(np.mean(np.subtract(*entry.hull()[::-1]))) for entry in tube.state_sets]

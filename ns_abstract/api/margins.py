@@ -83,7 +83,7 @@ class Margins:
 def certified_cells(
     rows: Mapping[int, Sequence[Mapping[str, Any]]], boxes: Callable[[int, Mapping[str, Any]], ParameterBox]
 ) -> list[CertifiedBox]:
-    """The certified cells of a store, with their parts of the volume; ``rows``: by frame, rows of ``cells``."""
+    """Return the certified cells of a store, with their parts of the volume; ``rows``: by frame, rows of ``cells``."""
     certified = [(frame, row, boxes(frame, row)) for frame, entries in rows.items() for row in entries]
     certified = [entry for entry in certified if entry[1]["verdict"] == "certified"]
     sizes = [float(np.prod(np.subtract(box.upper, box.lower))) for _, _, box in certified]

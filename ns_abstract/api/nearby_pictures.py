@@ -96,19 +96,19 @@ class KnownBoxes:
         self._motion = np.where(np.isfinite(motion), motion, np.inf)
 
     def near(self, cell: ParameterBox) -> NearbyPictures | None:
-        """Pictures of a cell, by what is known of a box around it; None: that box would be too wide."""
+        """Return pictures of a cell, by what is known of a box around it; None: that box would be too wide."""
         box = enclosing_box(cell, self._pictures.box, self._motion)
         if box is None:
             return None
         return self._inside(box, self._about(box))
 
     def _inside(self, box: ParameterBox, box_bounds: KnownBox) -> NearbyPictures:
-        """Pictures of cells inside ``box``, built on its known bounds and on draws of its unsettled pixels."""
+        """Return pictures of cells inside ``box``, built on its known bounds and on draws of its unsettled pixels."""
         draws = self._drawn(box, box_bounds)
         return NearbyPictures(self._pictures, self._weights, box_bounds, draws, self._measures, self._motion)
 
     def _about(self, box: ParameterBox) -> KnownBox:
-        """Known bounds of ``box``, from those of its enclosing shared box, if any; cached within `_TUNING.memory`."""
+        """Return the known bounds of ``box``, from those of its shared box, if any; cached within `_TUNING.memory`."""
         if box not in self._known:
             around = shared_box(box, self._pictures.box, self._motion)
             if around is None:
@@ -135,7 +135,7 @@ class KnownBoxes:
         return self._draws[box][1]
 
     def _examined(self, box: ParameterBox, outer: KnownBox | None, pictures: FrameImages) -> KnownBox:
-        """Bounds over a box, itself inside of one of which ``outer`` is known, with the ``pictures`` there."""
+        """Return bounds over a box, itself inside of one of which ``outer`` is known, with the ``pictures`` there."""
         shape = (*self._wanted.shape, 1 + max(self._channels))
         lower, upper = np.zeros(shape, np.float32), np.zeros(shape, np.float32)
         asked, elements = self._wanted, None
@@ -200,7 +200,7 @@ class NearbyPictures:
         self._draws, self._measures, self._motion = draws, measures, motion
 
     def image(self, values: np.ndarray, scene_sample: SceneSample | None = None) -> np.ndarray:
-        """Picture at a pose of the box: pixels that are settled are in the middle of their bounds."""
+        """Return the picture at a pose of the box: pixels that are settled are in the middle of their bounds."""
         assert scene_sample is None
         box_bounds = self._known
         image = 0.5 * (box_bounds.lower + box_bounds.upper)
@@ -215,7 +215,7 @@ class NearbyPictures:
         return self._pictures.scene_samples(seed)
 
     def differentiable(self, values: torch.Tensor) -> torch.Tensor:
-        """Picture at parameter values [d], every pixel as it is."""
+        """Return the picture at parameter values [d], every pixel as it is."""
         return self._pictures.differentiable(values)
 
     def linear_sets(self, box: ParameterBox) -> PixelSets:
@@ -288,13 +288,13 @@ class NearbyPictures:
         return NearbyPictures(self._pictures, self._weights, narrower, (), self._measures, self._motion)
 
     def _no_ends(self, counts: np.ndarray) -> SubBoxEnds:
-        """Ends over ``counts`` [d] sub-boxes of the pixels that are not settled, all zeros."""
+        """Return ends over ``counts`` [d] sub-boxes of the pixels that are not settled, all zeros."""
         pixels = np.flatnonzero(self._known.open)
         shape = int(counts.prod()), pixels.size, self._known.lower.shape[-1]
         return SubBoxEnds(counts, pixels, np.zeros(shape), np.zeros(shape))
 
     def cut_gains(self, box: ParameterBox) -> np.ndarray:
-        """[d] by how much sets of pixels narrow, about, where a cell is cut to nothing along each parameter (Q7).
+        """Return [d] estimates of how much sets of pixels narrow where a cell is cut to nothing along an axis (Q7).
 
         Slopes do not tell: sets follow them, and are as wide as pictures may be off these. Twice what the middle half
         of the cell is narrower, at a few of the pixels that are not settled. Zeros where nothing is to be compared.
@@ -313,7 +313,7 @@ class NearbyPictures:
         return 2.0 * np.maximum(0.0, widths[0] - np.array(widths[1:]))
 
     def _compared_width(self, box: ParameterBox) -> float:
-        """Width of the linear sets of a cell at a pose, a mean over pixels by frame."""
+        """Return the width of the linear sets of a cell at a pose, a mean over pixels by frame."""
         box_bounds, width = self._known, 0.0
         assert box_bounds.elements is not None
         places = np.flatnonzero(box_bounds.open)

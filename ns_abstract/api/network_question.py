@@ -70,7 +70,7 @@ class Question:
             )
 
     def searched(self, memory: int, arithmetic: NetworkArithmetic, picture: Picture) -> NetworkModel:
-        """The network, as the search bounds it with so many bytes.
+        """Return the network as a model of the search, whose bounds may take so many bytes.
 
         Raises:
             InputError: It takes whole numbers, and pictures are not of 8 bits.
@@ -81,7 +81,7 @@ class Question:
         return NetworkModel(self.network, self.property.preprocess, memory, arithmetic)
 
     def pictures(self, method: Method, poses: PoseBox, picture: Picture) -> FramePictures:
-        """The pictures of a set that are shown to the network."""
+        """Return the pictures of a set that are shown to the network."""
         return FramePictures(method, poses, picture)
 
     @property
@@ -95,7 +95,7 @@ class Question:
         return sum(math.prod(self.network.shape(k)) for k in range(len(self.network.nodes) + 1))
 
     def guarantee(self, arithmetic: NetworkArithmetic) -> tuple[str, ...]:
-        """Sentences on the evaluations of the network that the certificate covers."""
+        """Return sentences on the evaluations of the network that the certificate covers."""
         return self.network.guarantee(arithmetic)
 
     def check_memory(self, dimensions: int, memory: float) -> None:
@@ -107,16 +107,16 @@ class Question:
         check_cell(self.network, max(1, dimensions), memory)
 
     def describe(self) -> dict[str, Any]:
-        """The network for reports."""
+        """Return the network for reports."""
         shapes = {"input": self.network.input_shape, "output": self.network.output_shape}
         return {**self.network.stamp, **shapes}
 
     def fingerprint(self, arithmetic: NetworkArithmetic) -> dict[str, Any]:
-        """Identity of the network; a stored search with another one is not continued."""
+        """Return the identity of the network; a stored search with another one is not continued."""
         return {**network_prints("model", self.network), "network_arithmetic": arithmetic}
 
     def choices(self, arithmetic: NetworkArithmetic, picture: Picture) -> tuple[Assumption, ...]:
-        """What verdicts about the network rest on, and where each choice came from."""
+        """Return the assumptions of verdicts about the network, each with its origin."""
         name, output = self.source.name, self.source.value.get("output")
         return (
             choice("network output", self.network.output or "the only one", output, f"{name}: output"),
@@ -128,5 +128,5 @@ class Question:
         )  # fmt: skip
 
     def absolute(self) -> partial[Question]:
-        """How a process with another working directory asks it."""
+        """Return a partial that opens the same question in a process with another working directory."""
         return partial(Question, self.model.absolute(), self.source.absolute())

@@ -8,6 +8,6 @@ from ns_abstract.verify.network.graph import Network
 
 
 def network_prints(name: str, network: Network) -> dict[str, Any]:
-    """What a stored search must agree with on a network that it calls ``name``: its files as they were read."""
+    """Return the fingerprint of a network that a search calls ``name``: its files as they were read."""
     stamp = network.stamp
     return {name: stamp["sha256"], **({f"{name}_data": stamp["data"]} if "data" in stamp else {})}

@@ -152,7 +152,7 @@ class PlanePictures(FramePictures):
         return COLORS + len(self._planes)
 
     def image(self, values: np.ndarray, scene_sample: SceneSample | None = None) -> np.ndarray:
-        """Concrete picture [H, W, C] float32; see `ns_abstract.verify.protocol.FrameImages`."""
+        """Return the concrete picture [H, W, C] float32; see `ns_abstract.verify.protocol.FrameImages`."""
         values = np.asarray(values, np.float64)
         base = scene_sample.base if isinstance(scene_sample, PlaneSample) else scene_sample
         image = np.zeros((*self.wanted.shape, self.channels), np.float32)
@@ -210,7 +210,7 @@ class PlanePictures(FramePictures):
     def _bounded(
         self, frame: Frame, box: ParameterBox, channels: list[int], most_rays: int | None = None
     ) -> tuple[Bounds, np.ndarray]:
-        """Bounds of the tiles that hold `wanted` pixels, and these tiles' numbers.
+        """Return bounds of the tiles that hold `wanted` pixels, and these tiles' numbers.
 
         ``most_rays``: As of `RayFrame.cell_bounds`, where the frame is bounded ray by ray.
         """
@@ -246,7 +246,7 @@ class PlanePictures(FramePictures):
         return self if pictures is None else pictures
 
     def differentiable(self, values: torch.Tensor) -> torch.Tensor:
-        """Picture [H, W, C] at parameter values [d]; depths have no slope."""
+        """Return the picture [H, W, C] at parameter values [d]; depths have no slope."""
         planes: list[torch.Tensor] = [torch.zeros((*self.wanted.shape, 1), dtype=torch.float64)] * self.channels
         if "colors" in self._read:
             colors = super().differentiable(values)
@@ -269,7 +269,7 @@ class PlanePictures(FramePictures):
 
 
 def depth_range(lower: np.ndarray, upper: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Bounds [H, W] of depths, where nothing drawn is `FARTHEST`, from those of accumulation and depth (Q4).
+    """Return bounds [H, W] of depths, where nothing drawn is `FARTHEST`, from those of accumulation and depth (Q4).
 
     Args:
         lower, upper: [H, W, 5] bounds of a frame with layers.
@@ -303,7 +303,7 @@ class PictureQuestion:
             raise self.source.within(error) from None
 
     def drawn(self, poses: PoseBox) -> PoseBox:
-        """A set whose pictures have the size that the property asks for; by default its own."""
+        """Return the set with pictures of the size that the property asks for; by default their own."""
         resize = self.property.preprocess.resize
         return poses if resize is None else resized(poses, *resize)
 
@@ -328,7 +328,7 @@ class PictureQuestion:
             raise (error if error.file is not None else self.source.within(error)) from None
 
     def searched(self, memory: int, arithmetic: NetworkArithmetic, picture: Picture) -> MeasureModel:
-        """The measures, as the search bounds them.
+        """Return the property's measures as a model of the search.
 
         Raises:
             InputError: An option asks for another network or for what a network is shown.
@@ -340,7 +340,7 @@ class PictureQuestion:
         return self.property.model(*self._size)
 
     def pictures(self, method: Method, poses: PoseBox, picture: Picture) -> PlanePictures:
-        """The pictures of a set with what is read."""
+        """Return the pictures of a set, with the planes that the property reads."""
         return PlanePictures(method, poses, self.property)
 
     #: What the property is about, and what a measure costs beside a network; see `Question`.
@@ -360,7 +360,7 @@ class PictureQuestion:
         return {"name": self.name}
 
     def fingerprint(self, arithmetic: NetworkArithmetic) -> dict[str, Any]:
-        """What a stored search must agree with beside the property: the length of a unit of the data set."""
+        """Return the fingerprint besides the property: the length of a unit of the data set."""
         return {"model": None, "dataset_scale": self._dataset_scale}
 
     def choices(self, arithmetic: NetworkArithmetic, picture: Picture) -> tuple[Assumption, ...]:

@@ -132,7 +132,7 @@ class PoseSet:
         following: PinholeCamera | None = _UNSAID,
         folder: str | os.PathLike[str] | None = None,
     ) -> PoseSet:
-        """The set of an object as it stands in a perturbation file; all that the file can say.
+        """Return the set of an object as it stands in a perturbation file; all that the file can say.
 
         Args:
             specification: The object; None: the camera's pose alone.
@@ -177,7 +177,7 @@ class PoseSet:
         self.perturbation()
 
     def perturbation(self, dataset_scale: float | None = 1.0) -> Perturbation:
-        """What varies, in normalised units.
+        """Return the perturbation that this set states, in normalised units.
 
         Args:
             dataset_scale: Normalised units per unit of the data set; None: not known.
@@ -189,7 +189,7 @@ class PoseSet:
         return parse_perturbation(self.specification, dataset_scale=scale, field_prefix="", folder=self.folder)
 
     def of(self, scene: Scene) -> poses.PoseBox:
-        """The set for a scene, whose units it may be stated in.
+        """Return this set as a `PoseBox` of a scene, in whose units it may be stated.
 
         Raises:
             InputError: The set cannot be made.
@@ -205,7 +205,7 @@ class PoseSet:
 
 
 def pose_set(value: PoseSet | PinholeCamera, field: str = "poses") -> PoseSet:
-    """``value`` as a set of poses: a camera is the set of its one pose. Raises InputError where it is neither."""
+    """Return ``value`` as a set of poses; a camera is the set of its one pose. Raises InputError for other objects."""
     if isinstance(value, PinholeCamera):
         return PoseSet(value)
     if not isinstance(value, PoseSet):
@@ -215,7 +215,7 @@ def pose_set(value: PoseSet | PinholeCamera, field: str = "poses") -> PoseSet:
 
 
 def pose_sets(value: PoseSet | PinholeCamera | Sequence[PoseSet | PinholeCamera]) -> list[PoseSet]:
-    """``value`` as at least one set of poses, each as `pose_set` takes it.
+    """Return ``value`` as at least one set of poses; see `pose_set`.
 
     Raises:
         InputError: It is no set and no list of sets.

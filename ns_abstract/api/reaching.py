@@ -216,7 +216,7 @@ def reach(
 
 
 def result(job: LoopJob, rows: Mapping[int, list[Row]], document: Mapping[str, Any]) -> ReachResult:
-    """The result of a search that has ended with these rows of cells by question."""
+    """Return the result of a search that has ended with these rows of cells by question."""
     questions = document["questions"]
     fractions = {name: questions[name]["certified"] if name in questions else None for name in QUESTIONS}
     return ReachResult.of(

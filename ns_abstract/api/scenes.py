@@ -66,7 +66,7 @@ class Scene:
         self._methods: dict[tuple[str | None, int], Method] = {}
 
     def method(self, arithmetic: str | None = None, workers: int = 1) -> Method:
-        """The bounded program.
+        """Return the bounding method of this scene.
 
         Args:
             arithmetic: "float32" or "real"; None: the strongest that the representation has.
@@ -119,7 +119,7 @@ class Scene:
         return None if unsaid or isinstance(color, str) else tuple(map(float, color))
 
     def on_background(self, color: tuple[float, ...], origin: str) -> Scene:
-        """The same splats, not read again, before an RGB ``color``; ``origin`` says where it is from.
+        """Return the same scene on another RGB ``color``, not read again; ``origin`` says who chose it.
 
         Raises:
             InputError: It is no color of three numbers from 0 to 1.
@@ -143,7 +143,7 @@ class Scene:
 
 
 def checked_scene(value: Any) -> Scene:
-    """``value``, which is a scene. Raises InputError where it is none."""
+    """Return ``value``, which is a scene. Raises InputError where it is none."""
     if not isinstance(value, Scene):
         fix = "give what ns_abstract.load_scene returns"
         raise InputError(f"found {type(value).__name__}", field="scene", fix=fix)
@@ -151,7 +151,7 @@ def checked_scene(value: Any) -> Scene:
 
 
 def not_a_camera(value: Any, field: str = "camera") -> InputError:
-    """The error of the argument ``field`` that is no camera."""
+    """Return the error of the argument ``field`` that is no camera."""
     fix = "give an ns_abstract.Camera, or one of a path's .cameras"
     return InputError(f"found {type(value).__name__}", field=field, fix=fix)
 
@@ -195,7 +195,7 @@ def load_scene(
 
 
 def render(scene: Scene, camera: PinholeCamera) -> np.ndarray:
-    """The picture of one camera, float64 [H, W, 3] in [0, 1]: what `bound` encloses.
+    """Return the picture of one camera, float64 [H, W, 3] in [0, 1]: what `bound` encloses.
 
     Raises:
         InputError: The camera cannot be used.

@@ -29,7 +29,7 @@ _TEXT: Schema = {"type": "string", "minLength": 1}
 
 
 def _object(keys: Mapping[str, Schema], required: Iterable[str] = (), **more: Any) -> Schema:
-    """JSON schema of an object that has the ``required`` keys, and no key besides ``keys``."""
+    """Return the JSON schema of an object that has the ``required`` keys, and no key besides ``keys``."""
     return {
         "type": "object", "properties": dict(keys), "required": list(required), "additionalProperties": False, **more
     }  # fmt: skip
@@ -44,7 +44,7 @@ def _numbers(count: int, **more: Any) -> Schema:
 
 
 def _fields(names: Iterable[str], schemas: Mapping[str, Schema]) -> dict[str, Schema]:
-    """JSON schema by key, for all ``names``; a name that ``schemas`` lacks accepts any value."""
+    """Return the JSON schemas of all ``names``, by key; a name that ``schemas`` lacks accepts any value."""
     return {name: schemas.get(name, {}) for name in names}
 
 
@@ -58,7 +58,7 @@ _MATRIX = _list(_list(_NUMBER, 1), 1)
 
 
 def _select() -> Schema:
-    """A selection of Gaussians."""
+    """Return the JSON schema of a selection of Gaussians."""
     select = {
         "box": _list(_numbers(3), 2, 2, description="[[x0, y0, z0], [x1, y1, z1]]"),
         "indices": {"anyOf": [_list({"type": "integer", "minimum": 0}, 1), _TEXT]},
@@ -106,7 +106,7 @@ def _preprocess() -> Schema:
 
 
 def property_schema() -> Schema:
-    """The JSON Schema of a property file; what each type needs is said under the type."""
+    """Return the JSON schema of a property file; keys that a type needs are stated under the type."""
     count: Schema = {"type": "integer", "minimum": 1, "maximum": 10**9}
     share: Schema = {"type": "number", "minimum": MODERATE[0], "exclusiveMaximum": 1}
     tolerance = [
@@ -160,7 +160,7 @@ def property_schema() -> Schema:
 
 
 def _statements() -> dict[str, tuple[dict[str, Schema], list[str]]]:
-    """Keys of the properties of the picture by type, and those that are needed."""
+    """Return keys of the properties of the picture by type, and those that are needed."""
     size: Schema = {"type": "integer", "minimum": 0}
     box = {"anyOf": [_NULL, {"const": "all"}, _list(size, 4, 4)]}
     schemas: dict[str, Schema] = {
@@ -184,7 +184,7 @@ def _statements() -> dict[str, tuple[dict[str, Schema], list[str]]]:
 
 
 def _joined_statements() -> tuple[list[Schema], Schema]:
-    """Statements that are joined by all or any, and their parts under "$defs"."""
+    """Return statements that are joined by all or any, and their parts under "$defs"."""
     parts = _list({"$ref": "#/$defs/statement"}, 1)
     joined: list[Schema] = [{name: parts} for name in ("all", "any")]
     single = [
@@ -194,7 +194,7 @@ def _joined_statements() -> tuple[list[Schema], Schema]:
 
 
 def _views(beside: Mapping[str, Schema]) -> list[Schema]:
-    """Properties of the picture along a loop, with keys ``beside`` their own."""
+    """Return properties of the picture along a loop, with keys ``beside`` their own."""
     beside = {"preprocess": _object({"resize": _preprocess()["properties"]["resize"]}), **beside}
     single = [
         _object({**keys, **beside, "type": {"const": n}}, ["type", *required])
@@ -204,7 +204,7 @@ def _views(beside: Mapping[str, Schema]) -> list[Schema]:
 
 
 def _motion() -> Schema:
-    """The laws of motion, by type."""
+    """Return the laws of motion, by type."""
     schemas: dict[str, Schema] = {
         "A": _MATRIX, "B": _MATRIX, "c": _list(_NUMBER, 1), "file": _TEXT, "speed": _NUMBER, "lag": _POSITIVE,
         "gravity": _POSITIVE, "axes": {"type": "integer", "minimum": 1, "maximum": dynamics.MOST // 3},
@@ -266,7 +266,7 @@ def loop_schema() -> Schema:
 
 
 def _whole(name: str, title: str, root: Schema) -> Schema:
-    """The file's schema: editors name it under "$schema"."""
+    """Return the JSON schema of a file, which editors find under "$schema"."""
     properties = {"$schema": _NAMED, **root["properties"]}
     return {"$schema": DRAFT, "$id": f"urn:ns-abstract:{name}:1", "title": title, **root, "properties": properties}
 

@@ -87,7 +87,7 @@ class SearchOptions:
         report: bool = True,
         scene_margin: bool = False,
     ) -> tuple[dict[int, list[Row]], dict[str, Any]]:
-        """The cells by number and the content of report.json; Ctrl-C or the listener may end the search.
+        """Return the cells by number and the content of report.json; Ctrl-C or the listener may end the search.
 
         Args:
             question: What is claimed.
@@ -128,7 +128,7 @@ class SearchResult:
 
     @classmethod
     def of(cls: type[R], parameters: Sequence[tuple[str, str]], document: Mapping[str, Any], **more: Any) -> R:
-        """The result that a report's ``document`` tells of; ``more`` are the attributes of its kind."""
+        """Return the result of a report's ``document``; ``more`` are the attributes of its kind."""
         state, seconds = document["state"], document["seconds"]
         return cls(parameters=tuple(parameters), state=state, seconds=seconds, report=dict(document), **more)
 

@@ -32,7 +32,7 @@ _RULES = 3
 
 
 def load_motion(file: Path, sets: Mapping[int, PoseBox], dataset_scale: float | None) -> dict[str, Range]:
-    """By how much parameters may change from one photo to the next, by name.
+    """Return the ranges, by parameter, of the change from one photo to the next.
 
     Raises:
         InputError: The file states what is no motion, or one that a set has no parameter for.
@@ -60,7 +60,7 @@ def load_motion(file: Path, sets: Mapping[int, PoseBox], dataset_scale: float | 
 
 
 def grown(poses: PoseBox, hull: Mapping[str, Range], motion: Mapping[str, Range]) -> PoseBox:
-    """All poses that a motion takes poses of ``hull`` to (U7).
+    """Return all poses that a motion takes poses of ``hull`` to (U7).
 
     Args:
         motion: Ends of the changes; none where a translation or a rotation is not named. Other parameters, which no
@@ -83,7 +83,7 @@ def _along_path(sets: Mapping[int, PoseBox]) -> bool:
 def following(
     sets: Mapping[int, PoseBox], frames: Sequence[Mapping[str, Any]], motion: Mapping[str, Range]
 ) -> dict[int, PoseBox]:
-    """By number, the sets that the next photo may come from: none where nothing is left (U7).
+    """Return, by number, the sets that the next photo may come from: none where no pose is left (U7).
 
     Args:
         sets: Those that photos may come from, as they are given.
@@ -117,7 +117,7 @@ def _check_sizes(images: Sequence[Path]) -> None:
 
 
 def _seal(entry: Mapping[str, Any]) -> str:
-    """SHA-256 of what is known of a photo, without which a report that others have changed would be continued."""
+    """Return the SHA-256 of the stored bounds of a photo; a report that was edited is not continued."""
     sealed = {name: value for name, value in entry.items() if name != "sha256"}
     return hashlib.sha256(json.dumps(plain(sealed), sort_keys=True).encode()).hexdigest()
 
@@ -159,7 +159,7 @@ class PhotoSequence:
         self.entries: list[dict[str, Any]] = self._stored() if self.resume else []
 
     def _stored(self) -> list[dict[str, Any]]:
-        """Entries of the photos that an earlier command has finished, if its inputs were the same."""
+        """Return entries of the photos that an earlier command has finished, if its inputs were the same."""
         file = self.folder / _REPORT
         if not file.is_file():
             return []
@@ -213,7 +213,7 @@ class PhotoSequence:
         return self._write("interrupted" if self.entries[-1]["state"] == "interrupted" else "done")
 
     def _sets(self, k: int) -> dict[int, PoseBox]:
-        """Pose sets, by number, searched for photo ``k``: those given, or what photo k - 1 and the motion leave."""
+        """Return the pose sets, by number, searched for photo ``k``: those given, or what photo k - 1 leaves."""
         if k == 0:
             return self.sets
         return following(self.reached, self.entries[k - 1]["frames"], self.ranges)

@@ -65,7 +65,7 @@ def _subject(name: str, digest: str, *, of: str) -> dict[str, Any]:
 
 
 def _run_files(report: dict[str, Any], notes: list[str]) -> list[dict[str, Any]]:
-    """The scene's file, where it still holds the scene that was certified."""
+    """Return the record of the scene's file, if it still holds the certified scene."""
     source, config = report["scene"].get("source"), report["settings"].get("load_config")
     if not isinstance(source, str) or not isinstance(config, str):
         return []
@@ -82,7 +82,7 @@ def _run_files(report: dict[str, Any], notes: list[str]) -> list[dict[str, Any]]
 
 
 def _given_file(report: dict[str, Any], name: str) -> list[dict[str, Any]]:
-    """The file of the property or the loop, where it still says what was certified."""
+    """Return the record of the property's or the loop's file, if it still states what was certified."""
     file = report["settings"].get(name)
     try:
         read: dict[str, str] = {}

@@ -88,7 +88,7 @@ class InstanceFolder:
             self.origins[full] = self._provenance(job, frame, one, full)
 
     def _provenance(self, job: Certification, frame: int, box: ParameterBox, name: str) -> dict[str, Any]:
-        """Where an instance comes from: scene, property and pose, and its picture, which it writes."""
+        """Return the origin of an instance (scene, property and pose), and write its picture."""
         middle = np.array([0.5 * (low + high) for low, high in zip(box.lower, box.upper, strict=True)])
         poses, camera = job.job.pose_sets[frame], job.pictures(frame).frame.camera
         origin: dict[str, Any] = {

@@ -19,7 +19,7 @@ from ns_abstract.arithmetic.rounding import GRID_UP, INTERPOLATION_ROUNDINGS, ga
 
 
 def chebyshev_values(points: Float64Array, degree: int) -> Float64Array:
-    """[..., degree + 1] values of T_0 .. T_degree at ``points`` [...] in [-1, 1]."""
+    """Return [..., degree + 1] values of T_0 .. T_degree at ``points`` [...] in [-1, 1]."""
     angle = np.arccos(np.clip(points, -1.0, 1.0))
     return np.cos(angle[..., None] * np.arange(degree + 1))
 
@@ -55,7 +55,7 @@ class ChebyshevBasis:
         return np.array(points, np.float64).reshape(len(points), self.dimensions)
 
     def values(self, points: Float64Array) -> Float64Array:
-        """[n, m] values of the basis at ``points`` [n, d]."""
+        """Return [n, m] values of the basis at ``points`` [n, d]."""
         by_axis = chebyshev_values(np.asarray(points, np.float64), self.degree)
         out = np.ones((len(points), self.size))
         for j in range(self.dimensions):
@@ -126,7 +126,7 @@ class ChebyshevBasis:
         return 0.125 * step * step * GRID_UP * np.square(self.indices.astype(np.float64)).sum(axis=1)
 
     def bernstein(self, parts: tuple[int, ...]) -> Float64Array:
-        """[n, (degree + 1)^d, m]: Bernstein coefficients of every basis polynomial on equal parts of ``[-1, 1]^d``.
+        """Return [n, (degree + 1)^d, m] Bernstein coefficients of every basis polynomial, on parts of ``[-1, 1]^d``.
 
         A polynomial's values on a part lie between its least and largest Bernstein coefficient there.
 
@@ -146,7 +146,7 @@ class ChebyshevBasis:
 
 @lru_cache(maxsize=64)
 def bernstein_matrices(degree: int, parts: int) -> Float64Array:
-    """[parts, degree + 1, degree + 1] Bernstein coefficients of T_0 .. T_degree on equal parts of [-1, 1].
+    """Return [parts, degree + 1, degree + 1] Bernstein coefficients of T_0 .. T_degree on equal parts of [-1, 1].
 
     The monomials between the two bases cancel badly, so the entries are computed in integers and rounded once.
     """
@@ -157,7 +157,7 @@ def bernstein_matrices(degree: int, parts: int) -> Float64Array:
 
 @lru_cache(maxsize=64)
 def _bernstein_integers(degree: int, parts: int) -> tuple[NDArray[np.object_], int]:
-    """`bernstein_matrices` as numerators [parts, degree + 1, degree + 1] and their common denominator."""
+    """Return `bernstein_matrices` as numerators [parts, degree + 1, degree + 1] and a common denominator."""
     n = degree + 1
     if parts % 2 == 0:
         # de Casteljau: a row of left ends and a row of right ends of the triangle are the halves' coefficients

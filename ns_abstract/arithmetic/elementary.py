@@ -29,7 +29,7 @@ _C8, _C9, _C10, _C11, _C12 = _INVERSE_FACTORIALS[8:13]
 
 @intrinsic
 def fma(typingctx, x, y, z):  # pyright: ignore[reportRedeclaration]
-    """``x * y + z`` with one rounding, of floats or lanes."""
+    """Return ``x * y + z`` with one rounding, of floats or lanes."""
 
     def codegen(context, builder, sig, args):
         return by_intrinsic("fma", builder, *operands(builder, sig, args))
@@ -39,7 +39,7 @@ def fma(typingctx, x, y, z):  # pyright: ignore[reportRedeclaration]
 
 @intrinsic
 def _power_of_low_bits(typingctx, shifted):  # pyright: ignore[reportRedeclaration]
-    """2 to the power of the low bits of ``shifted``: moved into the exponent field, after its bias of 1023."""
+    """Return 2 to the power of the low bits of ``shifted``, moved into the exponent field (bias 1023)."""
 
     def codegen(context, builder, sig, args):
         kind, bits = args[0].type, ir.IntType(64)
@@ -74,7 +74,7 @@ if config.DISABLE_JIT:  # pyright: ignore[reportAttributeAccessIssue]
 
 @njit(inline="always", error_model="numpy")
 def exp_kernel(x):
-    """exp(x), EXP_LOWEST <= x <= EXP_HIGHEST, of floats or lanes, within EXP_RELATIVE_ERROR of it (design.md, E1)."""
+    """Return exp(x), EXP_LOWEST <= x <= EXP_HIGHEST, of floats or lanes, within EXP_RELATIVE_ERROR of it (E1)."""
     shifted = fma(x, _LOG2E, _ROUND_TO_INTEGER)
     k = shifted - _ROUND_TO_INTEGER
     r = fma(-k, _LN2_HIGH, x)

@@ -39,7 +39,7 @@ class FormArray:
 
     @classmethod
     def constant(cls, basis: Basis, values: Float64Array | float, radius: Float64Array | float = 0.0) -> FormArray:
-        """Constant forms of the numbers ``values``, each enclosing a ``radius`` around its number."""
+        """Return constant forms of the numbers ``values``, each with a ``radius`` around its number."""
         values = np.asarray(values, dtype=np.float64)
         data = np.zeros((basis.rows, values.size))
         data[0] = values.ravel()
@@ -49,7 +49,7 @@ class FormArray:
 
     @classmethod
     def parameter(cls, basis: Basis, index: int, middle: float = 0.0, half_width: float = 1.0) -> FormArray:
-        """The scalar form ``middle + half_width * p_index``."""
+        """Return the scalar form ``middle + half_width * p_index``."""
         form = cls.constant(basis, middle)
         form.data[1 + index] = half_width
         set_norms(form.data, *form._layout)
@@ -85,7 +85,7 @@ class FormArray:
         return other if isinstance(other, FormArray) else FormArray.constant(self.basis, other)
 
     def broadcast_to(self, shape: tuple[int, ...]) -> FormArray:
-        """The forms repeated to ``shape``."""
+        """Return the forms repeated to ``shape``."""
         if shape == self.shape:
             return self
         rows = self.basis.rows
@@ -137,7 +137,7 @@ class FormArray:
         return FormArray(self.basis, np.ascontiguousarray(data.reshape(rows, -1)), data.shape[1:])
 
     def sum(self, axis: int) -> FormArray:
-        """Sum over one axis, one addition at a time."""
+        """Return the sum over one axis, one addition at a time."""
         parts = [self[(slice(None),) * axis + (i,)] for i in range(self.shape[axis])]
         total = parts[0]
         for part in parts[1:]:
@@ -145,13 +145,13 @@ class FormArray:
         return total
 
     def flipped(self, signs: Float64Array) -> FormArray:
-        """The forms times ``signs`` (1 or -1, broadcast against ``shape``), without rounding."""
+        """Return the forms times ``signs`` (1 or -1, broadcast against ``shape``), without rounding."""
         data = self.data.copy()
         data[: self.basis.monomials].reshape(-1, *self.shape)[...] *= signs
         return FormArray(self.basis, data, self.shape)
 
     def transpose(self) -> FormArray:
-        """Matrix transpose of a two-dimensional array."""
+        """Return the matrix transpose of a two-dimensional array."""
         rows = self.basis.rows
         data = self.data.reshape(rows, *self.shape).swapaxes(1, 2)
         return FormArray(self.basis, np.ascontiguousarray(data).reshape(rows, -1), self.shape[::-1])
@@ -174,25 +174,25 @@ class FormArray:
         return FormArray(self.basis, out, self.shape)
 
     def square(self) -> FormArray:
-        """Element-wise square."""
+        """Return the element-wise square."""
         out = np.empty_like(self.data)
         square(self.data, out, *self._layout)
         return FormArray(self.basis, out, self.shape)
 
     def reciprocal(self) -> FormArray:
-        """Element-wise ``1 / x``; the radius is not finite unless bounds show ``x`` in `forms.reciprocal`'s range."""
+        """Return the element-wise ``1 / x``; its radius is not finite unless ``x`` is in `forms.reciprocal`'s range."""
         return self._unary(reciprocal)
 
     def sqrt(self) -> FormArray:
-        """Element-wise square root; the radius is not finite where ``x`` may be 0 or below."""
+        """Return the element-wise square root; the radius is not finite where ``x`` may be 0 or below."""
         return self._unary(square_root)
 
     def rsqrt(self) -> FormArray:
-        """Element-wise ``1 / sqrt(x)``; the radius is not finite where ``x`` may be 0 or below."""
+        """Return the element-wise ``1 / sqrt(x)``; the radius is not finite where ``x`` may be 0 or below."""
         return self._unary(reciprocal_square_root)
 
     def compose(self, f0, f1, f2_low, f2_high, f3) -> FormArray:
-        """Element-wise ``f(x)`` by the kernel `compose`; f0 to f3 as there, broadcast against ``shape``."""
+        """Return the element-wise ``f(x)`` by the kernel `compose`; f0 to f3 as there, broadcast against ``shape``."""
         values = np.empty((5, *self.shape))
         for row, value in enumerate((f0, f1, f2_low, f2_high, f3)):
             values[row] = value

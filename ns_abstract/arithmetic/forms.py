@@ -232,7 +232,7 @@ def square(a, out, d, order, m):
 
 @njit(cache=True, error_model="numpy")
 def bounds(a, low, high, d, order, m):
-    """``low[q] <= x_q(p) <= high[q]`` over the box, rounded outward (design.md, A4)."""
+    """Return ``low[q] <= x_q(p) <= high[q]`` over the box, rounded outward (design.md, A4)."""
     n = a.shape[1]
     if order == 1:
         for q in range(n):

@@ -66,7 +66,7 @@ _log = logging.getLogger("ns_abstract.kernels")
 
 @cache
 def source_key() -> str:
-    """Hash of the names and contents of all sources that kernels may use, and of the compiler's version."""
+    """Return the hash of all sources that kernels may use, and of the compiler's version."""
     digest = hashlib.sha256(numba.__version__.encode())
     for path in sorted(path for folder in FOLDERS for path in (PACKAGE / folder).rglob("*.py")):
         digest.update(path.relative_to(PACKAGE).as_posix().encode() + b"\0" + path.read_bytes() + b"\0")
@@ -137,7 +137,7 @@ class KernelStore:
 
     @contextmanager
     def complete(self) -> Iterator[None]:
-        """Context in which a kernel that is not cached raises `KernelMissingError` instead of being compiled."""
+        """Return a context in which a kernel that is not cached raises `KernelMissingError` and is not compiled."""
         self._complete = True
         try:
             yield
@@ -245,7 +245,7 @@ class KernelStore:
 
     @contextmanager
     def expecting(self, functions: int, seconds: float) -> Iterator[None]:
-        """Context that prints progress for about ``functions`` functions to compile in ``seconds``; 0: not known."""
+        """Return a context that prints progress for about ``functions`` to compile in ``seconds``; 0: not known."""
         self._progress = CompileProgress(functions, seconds, _PACE) if functions else None
         self._before, self._said = self.functions, time.monotonic()
         try:
@@ -383,7 +383,7 @@ def _open() -> KernelStore:
 
 @cache
 def store() -> KernelStore:
-    """The kernels of these sources. Raises InputError: no folder can be written, not even a temporary one."""
+    """Return the kernel store of these sources. Raises InputError: no folder can be written."""
     opened_store = _open()
     if (shipped := shipped_folder(PACKAGE, source_key())) is not None:
         opened_store.also_from(shipped, shipped=True)
@@ -396,7 +396,7 @@ def store() -> KernelStore:
 
 @cache
 def _kernel_module(file: str) -> tuple[str, str] | None:
-    """Name and source stamp of one of the package's modules that hold kernels; None: it is another file."""
+    """Return name and source stamp of one of the package's modules that hold kernels; None: it is another file."""
     path = Path(file).resolve()
     if not any(PACKAGE / folder in path.parents for folder in (*FOLDERS, OUTER)):
         return None
@@ -414,12 +414,12 @@ class KernelLocator:
 
     @classmethod
     def from_function(cls, py_func: Any, py_file: str) -> KernelLocator | None:
-        """The locator of a kernel of this package, else None."""
+        """Return the locator of a kernel of this package, else None."""
         module = _kernel_module(py_file)
         return None if module is None else cls(py_func, *module)
 
     def get_cache_path(self) -> str:
-        """Folder of the function's files."""
+        """Return the folder of the function's files."""
         return self._path
 
     def get_source_stamp(self) -> str:

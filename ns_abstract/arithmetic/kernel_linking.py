@@ -132,7 +132,7 @@ def install(done: Callable[[], object]) -> None:
 
 @contextmanager
 def _uncollected() -> Iterator[None]:
-    """Context without garbage collection: a compilation makes millions of objects and keeps them until it ends."""
+    """Return a context without garbage collection, as a compilation makes millions of objects and keeps them."""
     enabled = gc.isenabled()
     gc.disable()
     try:
@@ -143,7 +143,7 @@ def _uncollected() -> Iterator[None]:
 
 
 def _all_linked(library: Any) -> list[Any]:
-    """The libraries that ``library`` needs, each before what it needs itself: LLVM takes over only what is called."""
+    """Return libraries that ``library`` needs, each before those it needs itself: LLVM links only called functions."""
     libraries: dict[Any, None] = {}
 
     def visit(other: Any) -> None:

@@ -25,13 +25,13 @@ class LineForm(NamedTuple):
 
 @njit(cache=True, error_model="numpy", inline="always")
 def magnitude(a):
-    """Upper bound of the polynomial's absolute value, up to rounding."""
+    """Return an upper bound of the polynomial's absolute value, up to rounding."""
     return abs(a.center) + abs(a.slope) + abs(a.bend)
 
 
 @njit(cache=True, error_model="numpy", inline="always")
 def combined(a, s, b, t):
-    """``s a + t b`` for numbers ``s``, ``t`` (`forms.scale_add`)."""
+    """Return ``s a + t b`` for numbers ``s``, ``t`` (`forms.scale_add`)."""
     total = abs(s) * magnitude(a) + abs(t) * magnitude(b)
     radius = (abs(s) * a.radius + abs(t) * b.radius + FORM_ROUNDING * total) * UP + UNDERFLOW64
     return LineForm(s * a.center + t * b.center, s * a.slope + t * b.slope, s * a.bend + t * b.bend, radius)
@@ -39,7 +39,7 @@ def combined(a, s, b, t):
 
 @njit(cache=True, error_model="numpy", inline="always")
 def scaled(a, s):
-    """``s a`` for a number ``s`` (`forms.scale_add`)."""
+    """Return ``s a`` for a number ``s`` (`forms.scale_add`)."""
     return LineForm(
         s * a.center, s * a.slope, s * a.bend, (abs(s) * (a.radius + FORM_ROUNDING * magnitude(a))) * UP + UNDERFLOW64
     )
@@ -47,7 +47,7 @@ def scaled(a, s):
 
 @njit(cache=True, error_model="numpy", inline="always")
 def multiplied(a, b):
-    """``a b`` (design.md, A2; `forms.multiply`)."""
+    """Return ``a b`` (design.md, A2; `forms.multiply`)."""
     l, m = abs(a.slope), abs(a.bend)
     h, w = abs(b.slope), abs(b.bend)
     pa = abs(a.center) + l + m
@@ -63,7 +63,7 @@ def multiplied(a, b):
 
 @njit(cache=True, error_model="numpy", inline="always")
 def composed(a, f0, f1, f2, f3):
-    """``f(a)`` from value, slope, half curvature and a bound of ``|f'''|/6`` over the range (A3; `forms.compose`)."""
+    """Return ``f(a)`` from value, slope, half curvature and a bound of ``|f'''|/6`` over the range (A3)."""
     l, b, r = abs(a.slope), abs(a.bend), a.radius
     e = (l + b + r) * UP
     c2 = abs(f2)
@@ -81,7 +81,7 @@ def _least(a):
 
 @njit(cache=True, error_model="numpy", inline="always")
 def inverse(a):
-    """``1 / a`` for ``a > 0`` (`forms.reciprocal`)."""
+    """Return ``1 / a`` for ``a > 0`` (`forms.reciprocal`)."""
     low, inside = _least(a)
     f0 = 1.0 / (a.center if inside else 1.0)
     low2 = low * low
@@ -91,7 +91,7 @@ def inverse(a):
 
 @njit(cache=True, error_model="numpy", inline="always")
 def inverse_root(a):
-    """``1 / sqrt(a)`` for ``a > 0`` (`forms.reciprocal_square_root`)."""
+    """Return ``1 / sqrt(a)`` for ``a > 0`` (`forms.reciprocal_square_root`)."""
     low, inside = _least(a)
     f0 = 1.0 / np.sqrt(a.center if inside else 1.0)
     f2 = f0 * f0
@@ -101,7 +101,7 @@ def inverse_root(a):
 
 @njit(cache=True, error_model="numpy", inline="always")
 def ends(a):
-    """Bounds of ``a`` over the box, rounded outward (A4; `forms.bounds`)."""
+    """Return bounds of ``a`` over the box, rounded outward (A4; `forms.bounds`)."""
     g, s = abs(a.slope), a.bend
     spread = (a.radius + RANGE_ROUNDING * (abs(a.center) + g + abs(s))) * UP
     # g p + s p^2 over [-1, 1]: the ends, and the vertex where it lies inside
@@ -114,7 +114,7 @@ def ends(a):
 
 @njit(cache=True, error_model="numpy", inline="always")
 def raised(a, floor, low, high):
-    """``max(a, floor)`` given bounds of ``a`` (A5; `forms.clamp_below`)."""
+    """Return ``max(a, floor)`` given bounds of ``a`` (A5; `forms.clamp_below`)."""
     above = high - floor
     below = floor - low
     crosses = (low < floor) & (high > floor)
@@ -135,7 +135,7 @@ def raised(a, floor, low, high):
 
 @njit(cache=True, error_model="numpy", inline="always")
 def load(s, first, stride, q):
-    """The form of lane ``q`` from four rows of ``stride`` numbers, the first of which starts at ``first``."""
+    """Return the form of lane ``q`` from four rows of ``stride`` numbers, the first of which begins at ``first``."""
     return LineForm(s[first + q], s[first + stride + q], s[first + 2 * stride + q], s[first + 3 * stride + q])
 
 

@@ -367,7 +367,7 @@ NONZERO = 1e-300
 
 
 def taylor_product_rounding(monomials: int) -> float:
-    """Charge of a product of Taylor models: a coefficient sums at most as many products as there are (F1)."""
+    """Return charge of a product of Taylor models, whose coefficients sum at most one product by coefficient (F1)."""
     return (monomials + 2.0) * UNIT64
 
 
@@ -404,12 +404,12 @@ REAL = Arithmetic("real", UNIT64, UNDERFLOW64)
 
 
 def arithmetic(name: str) -> Arithmetic:
-    """The arithmetic called ``name`` ("float32" or "real")."""
+    """Return the arithmetic called ``name`` ("float32" or "real")."""
     return {"float32": FLOAT32, "real": REAL}[name]
 
 
 def gamma(operations: int, unit: float = UNIT64) -> float:
-    """Relative error of ``operations`` successive roundings, ``n u / (1 - n u)`` (Higham, Lemma 3.1)."""
+    """Return the relative error of ``operations`` successive roundings, ``n u / (1 - n u)`` (Higham, Lemma 3.1)."""
     product = operations * unit
     if not product < 0.5:
         raise ValueError(f"{operations} roundings of unit {unit} leave no digit")

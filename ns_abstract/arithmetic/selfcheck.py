@@ -81,14 +81,14 @@ FUNCTIONS: dict[str, Callable[[Float64Array, Float64Array], None]] = {
 
 
 def table(name: str) -> tuple[Float64Array, Float64Array, Float64Array]:
-    """Points of one function and the float64 neighbours of its values: x, lower, upper, each [n]."""
+    """Return points of one function and the float64 neighbours of its values: x, lower, upper, each [n]."""
     numbers = _TABLES.read_text(encoding="ascii").partition(f"[{name}]\n")[2].partition("[")[0].split()
     x, lower, upper = (np.array([float.fromhex(token) for token in numbers[k::3]]) for k in range(3))
     return x, lower, upper
 
 
 def check_functions(functions: Mapping[str, Callable[[Float64Array, Float64Array], None]] | None = None) -> list[str]:
-    """One sentence for each of this machine's functions that is less accurate than the bounds assume.
+    """Return a sentence for each of this machine's functions that is less accurate than the bounds assume.
 
     ``functions``: ``f(x, out)`` for arrays [n], by the names of `ASSUMED_ERRORS`; those the bounds use if None.
     """

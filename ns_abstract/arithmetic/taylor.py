@@ -64,7 +64,7 @@ class TaylorArray:
 
     @classmethod
     def constant(cls, basis: TaylorBasis, values: Float64Array | float) -> TaylorArray:
-        """The numbers ``values``."""
+        """Return the Taylor models of the numbers ``values``."""
         values = np.asarray(values, np.float64)
         coefficients = np.zeros((len(basis.exponents), *values.shape))
         coefficients[0] = values
@@ -72,7 +72,7 @@ class TaylorArray:
 
     @classmethod
     def parameter(cls, basis: TaylorBasis, index: int, middle: float = 0.0, half_width: float = 1.0) -> TaylorArray:
-        """The scalar ``middle + half_width * p_index``."""
+        """Return the scalar Taylor model ``middle + half_width * p_index``."""
         model = cls.constant(basis, middle)
         place = basis.exponents.index(tuple(int(k == index) for k in range(basis.dimensions)))
         model.coefficients[place] = half_width
@@ -94,7 +94,7 @@ class TaylorArray:
         return np.abs(self.coefficients).sum(axis=0) * TAYLOR_UP
 
     def widened(self, radius: Float64Array | float) -> TaylorArray:
-        """The same models with ``radius`` added to their radii."""
+        """Return the same models with ``radius`` added to their radii."""
         return TaylorArray(self.basis, self.coefficients, (self.radius + radius) * TAYLOR_UP)
 
     def _lift(self, other: TaylorArray | Float64Array | float) -> TaylorArray:
@@ -144,7 +144,7 @@ class TaylorArray:
         return TaylorArray(self.basis, self.coefficients[(slice(None), *index)], self.radius[index])
 
     def sum(self, axis: int) -> TaylorArray:
-        """Sum over one axis."""
+        """Return the sum over one axis."""
         parts = [self[(slice(None),) * axis + (i,)] for i in range(self.shape[axis])]
         return sum(parts[1:], start=parts[0])
 
@@ -158,7 +158,7 @@ class TaylorArray:
         return self._lift(other) @ self
 
     def compose(self, derivatives: Sequence[Float64Array], last: Float64Array) -> TaylorArray:
-        """``f`` of the array by Taylor's formula about the centre.
+        """Return ``f`` of the array by Taylor's formula about the centre.
 
         ``derivatives`` are ``f^(k)(centre) / k!`` for k up to the degree, each up to a relative rounding of 32 units;
         ``last`` is an upper bound of ``|f^(degree + 1)| / (degree + 1)!`` over the range.
@@ -173,7 +173,7 @@ class TaylorArray:
         return total.widened((slack + last * largest ** (self.basis.degree + 1)) * REMAINDER_UP)
 
     def rsqrt(self) -> TaylorArray:
-        """``1 / sqrt(x)``; not finite where ``x`` may be 0 or below."""
+        """Return ``1 / sqrt(x)``; not finite where ``x`` may be 0 or below."""
         n = self.basis.degree
         with np.errstate(all="ignore"):
             low = (self.center - (self.size - np.abs(self.center)) - self.radius) * (1.0 - LOWER_ROUNDING)
@@ -190,7 +190,7 @@ class TaylorArray:
 
 
 def taylor_cos_sin(angle: TaylorArray) -> tuple[TaylorArray, TaylorArray]:
-    """Cosine and sine of an angle in radians; the libraries' functions are charged four units."""
+    """Return the cosine and sine of an angle in radians; the libraries' functions are charged four units."""
     n = angle.basis.degree
     middle = angle.center
     cosine, sine = np.cos(middle), np.sin(middle)

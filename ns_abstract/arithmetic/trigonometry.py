@@ -10,7 +10,7 @@ from ns_abstract.arithmetic.rounding import ANGLE_ROUNDING, FUNCTION_ROUNDING
 
 
 def _cosine_range(low: Float64Array, high: Float64Array) -> tuple[Float64Array, Float64Array]:
-    """Bounds of cos over [low, high], rounded outward by four units."""
+    """Return bounds of cos over [low, high], rounded outward by four units."""
     at_low, at_high = np.cos(low), np.cos(high)
     least = np.minimum(at_low, at_high) - FUNCTION_ROUNDING
     most = np.maximum(at_low, at_high) + FUNCTION_ROUNDING
@@ -23,7 +23,7 @@ def _cosine_range(low: Float64Array, high: Float64Array) -> tuple[Float64Array, 
 
 
 def cos_sin(angle: FormArray) -> tuple[FormArray, FormArray]:
-    """Cosine and sine of an angle in radians (design.md, A3 with |f'''| <= 1).
+    """Return the cosine and sine of an angle in radians (design.md, A3 with |f'''| <= 1).
 
     The angle is taken to carry an absolute error of four units of ``|angle| + 1``, which covers
     its computation from a parameter and the library's sine and cosine.

@@ -39,14 +39,14 @@ class Case:
     blank: bool = False
 
     def pose_set(self) -> PoseBox:
-        """The poses."""
+        """Return the set of poses of the case."""
         return PoseBox.around(self.camera, parse_perturbation(self.spec), self.following)
 
 
 def _camera(
     width: int = 20, height: int | None = None, fov: float = 60.0, focal: float | None = None, pose: ArrayLike = _EYE
 ) -> PinholeCamera:
-    """A camera (vertical ``fov`` in degrees, or ``focal`` in pixels) that looks along its -z axis."""
+    """Return a camera (vertical ``fov`` in degrees, or ``focal`` in pixels) that looks along its -z axis."""
     height = width if height is None else height
     focal = 0.5 * height / math.tan(math.radians(0.5 * fov)) if focal is None else focal
     return PinholeCamera(np.array(pose, np.float64), focal, focal, 0.5 * width, 0.5 * height, width, height)
@@ -64,7 +64,7 @@ def _scene(
     antialiased: bool = False,
     model: Literal["sh", "sigmoid"] = "sh",
 ) -> SplatScene:
-    """A scene of Gaussians with standard deviations, opacities and colours as given, or what broadcasts to it.
+    """Return a scene of Gaussians with these standard deviations, opacities and colours, broadcast to it.
 
     ``means`` and ``scales`` are [N, 3], ``opacity`` [N] in [0, 1), ``colors`` [N, 3], logits for ``model`` "sigmoid",
     random if None; ``quats`` [N, 4]; ``bands`` [N, K - 1, 3] coefficients beyond band 0. ``antialiased``: whether
@@ -97,17 +97,17 @@ def _scene(
 
 
 def _cloud(count: int, seed: int = 0, *, depth: float = 2.0, spread: float = 0.7) -> np.ndarray:
-    """[count, 3] points of a cube of half-side ``spread`` whose middle lies ``depth`` in front of the camera."""
+    """Return [count, 3] points of a cube of half-side ``spread`` whose middle lies ``depth`` in front of the camera."""
     return np.random.default_rng(seed).uniform(-spread, spread, (count, 3)) - (0.0, 0.0, depth)
 
 
 def _quats(count: int, seed: int = 1) -> np.ndarray:
-    """[count, 4] random directions."""
+    """Return [count, 4] quaternions of random rotations."""
     return np.random.default_rng(seed).normal(size=(count, 4))
 
 
 def _turned(angle: float, position: ArrayLike) -> np.ndarray:
-    """The pose [3, 4] at ``position``, turned by ``angle`` (radians) about the y axis."""
+    """Return the pose [3, 4] at ``position``, turned by ``angle`` (radians) about the y axis."""
     c, s = math.cos(angle), math.sin(angle)
     turn = np.array([[c, 0.0, s], [0.0, 1.0, 0.0], [-s, 0.0, c]])
     return np.concatenate([turn, np.asarray(position, np.float64).reshape(3, 1)], axis=1)
@@ -120,7 +120,7 @@ def _orbit(low: float, high: float, target: ArrayLike = (0.0, 0.0, -2.0)) -> dic
 
 
 def _shapes() -> list[Case]:
-    """Sizes and proportions of Gaussians."""
+    """Return cases of extreme sizes and proportions of Gaussians."""
     camera, few = _camera(), _cloud(6)
     needles: dict[str, Any] = {"scales": _NEEDLE, "quats": _quats(6), "opacity": 0.95}
     # thick enough for the compensated opacity to stay above the threshold
@@ -173,7 +173,7 @@ def _shapes() -> list[Case]:
 
 
 def _opacities() -> list[Case]:
-    """Opacities, the skipped alpha, the largest alpha, and the stop."""
+    """Return cases at the skipped alpha, the largest alpha, and the stop."""
     camera, few = _camera(), _cloud(6)
     line = [[0.0, 0.0, -1.0 - 0.25 * k] for k in range(6)]
     # float32 neighbours of the logit at which alpha is 1/255
@@ -205,7 +205,7 @@ def _opacities() -> list[Case]:
 
 
 def _orders() -> list[Case]:
-    """Depth ties, coincident Gaussians, far-away coordinates and scales of whole scenes."""
+    """Return cases of depth ties, coincident Gaussians, far-away coordinates and scales of whole scenes."""
     camera, few = _camera(), _cloud(6)
     tie = [[-0.2, 0.0, -2.0], [0.0, 0.1, -2.0], [0.2, 0.0, -2.0], [0.0, -0.1, -2.0]]
     after = float(np.nextafter(np.float32(2.0), np.float32(3.0)))
@@ -238,7 +238,7 @@ def _orders() -> list[Case]:
 
 
 def _places() -> list[Case]:
-    """Near plane, image and tile borders, fields of view."""
+    """Return cases at the near plane, image and tile borders, and of fields of view."""
     camera, few = _camera(), _cloud(6)
     close = [[0.0, 0.0, -0.01], [0.002, 0.001, -0.012], [0.0, 0.0, -2.0]]
     # 0.01 as a float32 and its neighbours
@@ -276,7 +276,7 @@ def _places() -> list[Case]:
 
 
 def _poses() -> list[Case]:
-    """Widths of sets: none, an ulp, whole turns, through the object."""
+    """Return cases of set widths: none, an ulp, whole turns, through the object."""
     camera, few = _camera(), _cloud(6)
     ball: dict[str, Any] = {"means": _cloud(8, 2), "scales": (0.3, 0.1, 0.05), "quats": _quats(8)}
     half = _camera(pose=_turned(math.pi - 1e-3, (0.0, 0.0, -4.0)))
@@ -308,7 +308,7 @@ def _poses() -> list[Case]:
 
 
 def _colors() -> list[Case]:
-    """Spherical harmonics and sigmoid colours."""
+    """Return cases of spherical harmonics and sigmoid colours."""
     camera, few = _camera(), _cloud(6)
     rng = np.random.default_rng(8)
     loud, quiet = 1e3 * rng.normal(size=(6, 15, 3)), 0.2 * rng.normal(size=(6, 15, 3))
@@ -325,7 +325,7 @@ def _colors() -> list[Case]:
 
 
 def all_cases() -> list[Case]:
-    """Every case, in the order of the table."""
+    """Return every case, in the order of the table."""
     return [*_shapes(), *_opacities(), *_orders(), *_places(), *_poses(), *_colors()]
 
 

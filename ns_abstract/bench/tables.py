@@ -90,7 +90,7 @@ def plot_scaling(path: Path, rows: Sequence[Mapping[str, Any]]) -> None:
 
 
 def _two_panels() -> Any:
-    """A figure and its two axes."""
+    """Return a figure and its two axes."""
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
 

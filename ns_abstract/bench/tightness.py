@@ -18,7 +18,7 @@ MARKS = (1.5, 1.25, 1.1, 1.05, 1.02, 1.01)
 
 
 def refine(job: PathJob, poses: PoseBox, frame: int, seconds: float, ratio: float) -> FrameResult:
-    """The abstract image of ``poses`` about entry ``frame``; kernels are compiled before the clock starts."""
+    """Return the abstract image of ``poses`` about entry ``frame``; kernels are compiled before the clock begins."""
     view, seed = job.method.frame(poses, sheared=True), job.seed
     view.warm_up()
     result = Refinement(view, frame, job.goal(ratio, seconds), seed=seed, scene_samples=view.scene_samples(seed)).run()
@@ -26,7 +26,7 @@ def refine(job: PathJob, poses: PoseBox, frame: int, seconds: float, ratio: floa
 
 
 def summary(job: PathJob, name: str, result: FrameResult) -> dict[str, object]:
-    """One row: final figures, and the seconds after which each of `MARKS` was reached."""
+    """Return one row of the table: final figures, and the seconds after which each of `MARKS` was reached."""
     last = result.trace[-1]
     row: dict[str, object] = {
         "scene": job.method.name,

@@ -53,7 +53,7 @@ class Instance:
 
 
 def instances(folder: Path) -> list[Instance]:
-    """The lines of ``folder/instances.csv``: network, property, seconds.
+    """Return the lines of ``folder/instances.csv``: network, property, seconds.
 
     Raises:
         InputError: The list is absent, or a line is not understood.
@@ -83,7 +83,7 @@ def instances(folder: Path) -> list[Instance]:
 
 
 def version_folder(folder: Path) -> Path:
-    """The folder of instances.csv: ``folder`` itself, or of its parts 2.0 and 1.0 the first that has one."""
+    """Return the folder of instances.csv: ``folder`` itself, or the first of its parts 2.0 and 1.0 that has one."""
     for part in (folder, folder / "2.0", folder / "1.0"):
         if (part / "instances.csv").exists():
             return part
@@ -91,7 +91,7 @@ def version_folder(folder: Path) -> Path:
 
 
 def networks_of(text: str) -> dict[str, str]:
-    """Files by the names of networks, of ``[('f', 'net.onnx')]``; a file alone has the name "".
+    """Return files by the names of networks, from ``[('f', 'net.onnx')]``; a file alone has the name "".
 
     Raises:
         InputError: The list is not understood.
@@ -110,7 +110,7 @@ def networks_of(text: str) -> dict[str, str]:
 
 
 def stored_file(folder: Path, name: str) -> Path:
-    """The file that a line names, or the same packed."""
+    """Return the file that a line names, or its packed form."""
     path = file_beside(folder, name)
     if path.suffix != ".gz" and not path.exists():
         packed = file_beside(folder, f"{name}.gz")
@@ -221,7 +221,7 @@ def run_folder(
 
 
 def _stem(name: str) -> str:
-    """A file's name without its endings."""
+    """Return a file's name without its endings."""
     # the last of a list's files
     last = re.sub(r"[\[\]()' ]", "", Path(name).name)
     for ending in (".gz", ".onnx", ".vnnlib"):
@@ -230,7 +230,7 @@ def _stem(name: str) -> str:
 
 
 def assignment(answer: Decision, query: Vnnlib2Query | None = None) -> str:
-    """A counterexample as the competitions want it, of a query of version 2 in its form; nothing without one."""
+    """Return a counterexample in the form of the competitions, of a query of version 2 in its own; "" without one."""
     if answer.x is None or answer.y is None:
         return ""
     if query is not None:
@@ -243,7 +243,7 @@ def assignment(answer: Decision, query: Vnnlib2Query | None = None) -> str:
 def _question(
     network: Network, run: Any, file: Path, name: str, memory: int, arithmetic: NetworkArithmetic
 ) -> tuple[tuple[InputRegion, ...], Vnnlib2Query | None]:
-    """What a property file asks of the network, which is compared with the program that runs it.
+    """Return the network and question of a property file, once the network agrees with its runtime.
 
     Raises:
         InputError: The file is about another network, or asks more than ``arithmetic`` covers.

@@ -220,7 +220,7 @@ def loops(options: Loops) -> int:
 def rows_of(
     options: CellBenchmark | Compile | Soundness | PlanBenchmark | RulesBenchmark | Rays, job: PathJob, name: str
 ) -> list[dict[str, Any]]:
-    """What a benchmark without curves finds for one scene and set of poses."""
+    """Return the rows of a benchmark without curves for one scene and set of poses."""
     if isinstance(options, CellBenchmark):
         from ns_abstract.bench.scale import cell_cost
 

@@ -249,7 +249,7 @@ class Locate(_PathCommand):
 
 
 def _files(options: _PathCommand, **more: Any) -> Settings:
-    """The files of a command, and what is bounded of them. Raises InputError: options do not go together."""
+    """Return the settings that a command's files and options give. Raises InputError: options do not go together."""
     from ns_abstract.api.files import Settings
 
     return Settings(

@@ -90,7 +90,7 @@ class SignalStop(StopRequest):
 
 
 def command(program: str, kind: Any, parts: Mapping[str, Any] | None = None, about: str = "") -> Callable[[], Any]:
-    """What parses a command line, or prints the command's version or help and leaves.
+    """Return a function that parses a command line, or prints the command's version or help and leaves.
 
     Args:
         program: The console script.
@@ -176,7 +176,7 @@ def complaint(text: str) -> str:
 
 
 def _named(lines: list[str]) -> list[str]:
-    """Names of the options in lines of a help page: those at line starts with the least indentation."""
+    """Return the names of options in lines of a help page: those at line starts with the least indentation."""
     matches = [match for line in lines if (match := re.match(r"( +)(--?[a-z][\w-]*)", line))]
     outermost = min((len(match[1]) for match in matches), default=0)
     return [match[2] for match in matches if len(match[1]) == outermost]

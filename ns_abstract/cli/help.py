@@ -39,7 +39,7 @@ _MOST_COLUMNS = 100
 
 
 def _sources(kind: type) -> dict[str, str]:
-    """The text below each field of a dataclass, those of its bases included."""
+    """Return the text below each field of a dataclass, and of its bases."""
     texts: dict[str, str] = {}
     for base in reversed(kind.__mro__):
         if not dataclasses.is_dataclass(base):
@@ -54,7 +54,7 @@ def _sources(kind: type) -> dict[str, str]:
 
 
 def _plain(hint: Any) -> Any:
-    """A type without annotations and None."""
+    """Return a type without annotations and None."""
     while get_origin(hint) is Annotated:
         hint = get_args(hint)[0]
     if get_origin(hint) in (Union, types.UnionType):
@@ -64,7 +64,7 @@ def _plain(hint: Any) -> Any:
 
 
 def _value(hint: Any, flags: bool = True) -> str:
-    """Placeholder of an option's value in help, from its type ``hint``; "" for a bool if ``flags`` take no value."""
+    """Return the placeholder of an option's value, from its type ``hint``; "" for a bool if ``flags`` take no value."""
     hint = _plain(hint)
     parts = get_args(hint)
     if get_origin(hint) is Literal:
@@ -103,7 +103,7 @@ class _Option:
 
 
 def _options(kind: type, given: Any = None, flags: bool = True) -> Iterator[_Option]:
-    """The options of a command's dataclass, those of its parts included."""
+    """Return the options of a command's dataclass, those of its parts included."""
     texts, hints = _sources(kind), get_type_hints(kind, include_extras=True)
     for field in dataclasses.fields(kind):
         hint = _plain(hints[field.name])
@@ -156,7 +156,7 @@ def _examples(program: str, width: int) -> str:
 
 
 def _command(text: str, width: int) -> str:
-    """A command that can be pasted, in lines."""
+    """Return the lines of a command that can be pasted."""
     lines = textwrap.wrap(text, width - 8, break_long_words=False, break_on_hyphens=False)
     return " \\\n".join(f"  {line}" if k == 0 else f"      {line}" for k, line in enumerate(lines))
 
@@ -166,7 +166,7 @@ def columns() -> int:
 
 
 def command_help(program: str, kind: type, given: Any = None) -> str:
-    """Help on a command whose options are a dataclass; ``given`` has other defaults."""
+    """Return the help on a command whose options are a dataclass; ``given`` has other defaults."""
     flags = "FlagConversionOff" not in str(kind)
     kind, width = _plain(kind), columns()
     options = list(_options(kind, given, flags))
@@ -186,7 +186,7 @@ def command_help(program: str, kind: type, given: Any = None) -> str:
 
 
 def parts_help(program: str, parts: Mapping[str, Any], about: str) -> str:
-    """Help on a command with sub-commands: what each does."""
+    """Return the help on a command with sub-commands: what each does."""
     width, wide = columns(), max(map(len, parts))
     lines = [_wrapped(about, width), "", f"usage: {program} NAME [options]", _examples(program, width), "", "names:"]
     for name, part in parts.items():
@@ -199,7 +199,7 @@ def parts_help(program: str, parts: Mapping[str, Any], about: str) -> str:
 
 
 def help_page(program: str, kind: Any, words: list[str], parts: Mapping[str, Any], about: str) -> str | None:
-    """The text that ``words`` of a command line ask for, its version or help, or None."""
+    """Return the text that ``words`` of a command line request, its version or help, or None."""
     if "--version" in words:
         return f"{program} {VERSION}"
     if not {"-h", "--help"} & set(words):

@@ -191,7 +191,7 @@ def _run_record(job: Job, options: Render | Compare, frames: tuple[int, ...], pr
 
 
 def _leaf_bytes(job: Job) -> int:
-    """Bytes of the float32 linear sets of one cell of the first frame; 0 for a job that bounds rays."""
+    """Return the bytes of the float32 linear sets of one cell of the first frame; 0 for a job that bounds rays."""
     camera, box = job.pose_sets[0].camera, job.pose_sets[0].box
     return 0 if job.rays else camera.width * camera.height * 3 * 2 * (box.dimensions + 1) * 4
 

@@ -41,7 +41,7 @@ class GivenSet:
 
 
 def given_set(options: GivenSet) -> dict[str, Any] | None:
-    """The set of --translation and --rotation as the content of a perturbation file, or None.
+    """Return the set of --translation and --rotation as the content of a perturbation file, or None.
 
     Raises:
         InputError: They do not go together, or with other options.
@@ -64,7 +64,7 @@ def given_set(options: GivenSet) -> dict[str, Any] | None:
 
 
 def stated(options: Any) -> dict[str, Any]:
-    """All options of a command by name, as reports state them."""
+    """Return all options of a command by name, in the form of reports."""
     options_by_name: dict[str, Any] = {}
     for entry in fields(options):
         value = getattr(options, entry.name)

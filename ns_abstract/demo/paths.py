@@ -15,18 +15,18 @@ TARGET = (0.0, 0.0, 0.01)
 
 
 def airfield_views(size: int = 200) -> list[KeyframeCamera]:
-    """Five views of the airfield: from the aircraft's side round to the front, runway behind it."""
+    """Return the five views of the airfield: from the aircraft's side round to the front, runway behind it."""
     places = ((-62.0, 13.0), (-50.0, 14.0), (-37.0, 15.0), (-25.0, 16.0), (-12.0, 17.0))
     return [around(TARGET, a, e, 1.0, height=size, width=size) for a, e in places]
 
 
 def dataset_views(count: int = 10, size: int = 200) -> list[KeyframeCamera]:
-    """Views all around the airfield for the data set beside a run."""
+    """Return views all around the airfield for the data set beside a run."""
     return ring(TARGET, 1.05, count, size)
 
 
 def gate_views(count: int = 10, size: int = 200) -> list[KeyframeCamera]:
-    """Views along the gate's course for the data set beside a run; the nearer to the gate, the nearer to its axis."""
+    """Return views along the gate's course for the data set beside a run; the nearer, the closer to the gate's axis."""
     rng = np.random.default_rng(0)
     end = 0.06 + 0.1 * 0.35 * 24
     along = rng.uniform(0.0, end, count)
@@ -41,17 +41,17 @@ def gate_views(count: int = 10, size: int = 200) -> list[KeyframeCamera]:
 
 
 def airfield_path(size: int = 200) -> dict[str, Any]:
-    """The five views of ``airfield_views`` as a camera path."""
+    """Return the five views of ``airfield_views`` as a camera path."""
     return path_json(airfield_views(size))
 
 
 def airfield_perturbation() -> dict[str, Any]:
-    """A sideways shift of 0.02 scene units either way."""
+    """Return the set of sideways shifts by up to 0.02 scene units."""
     return {"version": 1, "frame": "camera", "translation": {"x": 0.02}, "sweep": "keyframes"}
 
 
 def airfield_orbit(size: int = 32) -> dict[str, Any]:
-    """One view and the set of all its rotations about the vertical axis through the aircraft."""
+    """Return one view, and the set of all its rotations about the vertical axis through the aircraft."""
     perturbation = {
         "version": 1,
         "sweep": "keyframes",

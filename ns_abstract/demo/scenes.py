@@ -62,7 +62,7 @@ def _stored(file: Path) -> Iterator[_ArchiveUnpickler]:
 
 
 def splat_scene(name: str, file: Path | None = None) -> SplatScene:
-    """The airfield or the gate.
+    """Return the scene of the airfield or of the gate.
 
     The airfield: an airliner on short final over a small airfield, 17,564 Gaussians with spherical harmonics of
     degree 2; z is up, the runway lies along x. The gate: a ring on two posts on a meadow, 75 wide Gaussians, no two of
@@ -87,7 +87,7 @@ def splat_scene(name: str, file: Path | None = None) -> SplatScene:
 
 
 def buoy_weights(file: Path = DATA / "buoy.npz") -> FieldWeights:
-    """A field of Nerfstudio's own size (8 x 256) that was fitted to a buoy on a round float.
+    """Return a field of Nerfstudio's own size (8 x 256) that was fitted to a buoy on a round float.
 
     Args:
         file: Holds biases in float32, and matrices in int8 beside ``NAME.scale`` [rows, 1] in float32.
@@ -115,13 +115,13 @@ def buoy_weights(file: Path = DATA / "buoy.npz") -> FieldWeights:
 
 
 def buoy_scene() -> NerfScene:
-    """A NeRF of Nerfstudio's own size that shows the buoy."""
+    """Return a NeRF of Nerfstudio's own size that shows the buoy."""
     weights = buoy_weights()
     return NerfScene(weights, weights, background=np.array([1.0, 1.0, 1.0], np.float32), name="buoy")
 
 
 def nerfacto_scene(file: Path = DATA / "buoy_nerfacto.npz") -> NerfactoScene:
-    """A small nerfacto of the buoy, which Nerfstudio trained on pictures of it.
+    """Return a small nerfacto of the buoy, which Nerfstudio trained on pictures of it.
 
     Args:
         file: Holds networks in float32, and tables in int8 beside ``NAME.scale`` [levels, 1, 1] in float32.
@@ -162,19 +162,19 @@ def nerfacto_scene(file: Path = DATA / "buoy_nerfacto.npz") -> NerfactoScene:
 
 
 def nerfacto_path(size: int = 16) -> dict[str, Any]:
-    """The view of `buoy_path` as nerfacto shows it, and a yaw of 0.0001 rad either way."""
+    """Return the view of `buoy_path` for nerfacto, with a set of yaws of up to 0.0001 rad."""
     return _buoy_path(size, NERFACTO_SCALE, 0.0001)
 
 
 def buoy_views(count: int = 8, size: int = 64, scale: float = 1.0) -> list[KeyframeCamera]:
-    """Views all around the buoy for the data set beside the run; ``scale``: the run's units by one of the buoy."""
+    """Return views all around the buoy for the run's data set; ``scale``: the run's units by one of the buoy."""
     angles = 2.0 * np.pi * np.arange(count) / count
     eyes = [(scale * 3.2 * np.cos(a), scale * 3.2 * np.sin(a), scale * 1.2) for a in angles]
     return [KeyframeCamera(look_at(eye, (0.0, 0.0, scale * 0.1)), 40.0, size, size) for eye in eyes]
 
 
 def buoy_path(size: int = 16) -> dict[str, Any]:
-    """One small view of the buoy, and a yaw of 0.002 rad either way."""
+    """Return one small view of the buoy, with a set of yaws of up to 0.002 rad."""
     return _buoy_path(size, 1.0, 0.002)
 
 

@@ -49,7 +49,7 @@ def is_inria(root: Any) -> bool:
 
 
 def inria_cameras(root: list[dict[str, Any]]) -> Iterator[FileCamera]:
-    """The cameras of Inria's ``cameras.json``, in the frame of its .ply."""
+    """Return the cameras of Inria's ``cameras.json``, in the frame of its .ply."""
     for i, entry in enumerate(root):
         field = f"[{i}]"
         rotation = _matrix(entry.get("rotation"), 3, 3, f"{field}.rotation")
@@ -64,7 +64,7 @@ def inria_cameras(root: list[dict[str, Any]]) -> Iterator[FileCamera]:
 def transforms_cameras(
     root: Mapping[str, Any], frame: DataparserTransform | None, folder: Path
 ) -> Iterator[FileCamera]:
-    """The cameras of a data set's ``transforms.json``, in the frame of a run that was trained on it.
+    """Return the cameras of a data set's ``transforms.json``, in the frame of a run that was trained on it.
 
     As in Nerfstudio (nerfstudio_dataparser.py), values at the top level come before those of a frame. Raises
     InputError: there is no run, a camera is not a plain perspective one, or a field is missing.

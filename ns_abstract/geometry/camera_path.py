@@ -62,7 +62,7 @@ class PinholeCamera:
         return Intrinsics(self.fx, self.fy, self.cx, self.cy, float(self.width), float(self.height))
 
     def rescaled(self, downscale_factor: float) -> PinholeCamera:
-        """The camera of an image ``downscale_factor`` times smaller; sides are rounded down.
+        """Return the camera of an image ``downscale_factor`` times smaller; sides are rounded down.
 
         Uses the arithmetic of nerfstudio's ``Cameras.rescale_output_resolution``, which holds the factor and the
         principal point in float32, so that sizes agree with ns-render. Raises InputError where the factor is not a
@@ -95,7 +95,7 @@ class PinholeCamera:
         )
 
     def resized(self, height: int, width: int) -> PinholeCamera:
-        """The camera that shows the same picture with other pixels, as if it had been resized.
+        """Return the camera that shows the same picture with other pixels, as if it had been resized.
 
         Each direction has its own factor, so another aspect ratio squeezes the picture.
         """
@@ -126,12 +126,12 @@ class CameraPath:
     notes: tuple[str, ...] = ()
 
     def perturbation_of(self, index: int) -> Mapping[str, Any] | None:
-        """The perturbation object that holds for camera ``index``: its own, else the path's."""
+        """Return the perturbation object that holds for camera ``index``: its own, else the path's."""
         own = self.overrides[self._place(index)]
         return self.perturbation if own is None else own
 
     def _place(self, index: int) -> int:
-        """``index`` as a number from 0; a negative one counts from the end. Raises InputError: out of range."""
+        """Return ``index`` as a number from 0; a negative one counts from the end. Raises InputError: out of range."""
         count = len(self.cameras)
         number = whole(index, -count, "index", count - 1)
         return number + count if number < 0 else number
@@ -142,7 +142,7 @@ class CameraPath:
         return tuple(self.perturbation_of(k) for k in range(len(self.cameras)))
 
     def following(self, index: int) -> PinholeCamera | None:
-        """The camera after ``index``: after the last one the first where the path closes, else None."""
+        """Return the camera after ``index``; after the last one the first if the path closes, else None."""
         index = self._place(index)
         if index + 1 < len(self.cameras):
             return self.cameras[index + 1]
@@ -177,7 +177,7 @@ def load_camera_path(
 
 
 def _photo_path(file_cameras: Iterable[FileCamera], source: str, downscale_factor: float) -> CameraPath:
-    """Path of the cameras of photos, without perturbations; ``source``: the file. Raises InputError."""
+    """Return the path of the cameras of photos, without perturbations; ``source``: the file. Raises InputError."""
     cameras = []
     for entry in file_cameras:
         camera = PinholeCamera(
@@ -194,14 +194,14 @@ def _photo_path(file_cameras: Iterable[FileCamera], source: str, downscale_facto
 
 
 def focal_pixels(value: Any, field: str) -> float:
-    """``value`` as a focal length in pixels. Raises InputError where it is no moderate number above 0."""
+    """Return ``value`` as a focal length in pixels. Raises InputError where it is no moderate number above 0."""
     if not is_moderate(value) or not value > 0:
         raise unusable(value, field=field, fix="write a number of pixels above 0")
     return float(value)
 
 
 def principal_place(value: Any, side: int, field: str) -> float:
-    """``value`` as a coordinate of the principal point, pixels; half of ``side`` if it is None. Raises InputError."""
+    """Return ``value`` as a coordinate of the principal point, pixels; half of ``side`` if None. Raises InputError."""
     if value is not None and not is_moderate(value):
         raise unusable(value, field=field, fix="write a number of pixels")
     return side / 2 if value is None else float(value)
@@ -210,7 +210,7 @@ def principal_place(value: Any, side: int, field: str) -> float:
 def stated_intrinsics(
     own: Mapping[str, Any], focal: Callable[[], float], height: int, width: int, prefix: str = ""
 ) -> Intrinsics:
-    """Intrinsics in pixels as a file or a caller states them.
+    """Return intrinsics in pixels as a file or a caller states them.
 
     Raises InputError: one of them is no moderate number, or a focal length is not above 0.
 
@@ -266,7 +266,7 @@ def _parse(root: dict[str, Any], source: str, downscale_factor: float) -> Camera
 
 
 def _lens_of_fov(entry: Mapping[str, Any], lens: Intrinsics) -> Intrinsics:
-    """Intrinsics with which ns-render draws an ``entry``, from ``fov`` alone; ``lens`` without a usable one."""
+    """Return intrinsics with which ns-render draws an ``entry``, from ``fov`` alone; ``lens`` without a usable one."""
     fov = entry.get("fov")
     if not is_number(fov) or not 0 < fov < 180:
         return lens
@@ -275,7 +275,7 @@ def _lens_of_fov(entry: Mapping[str, Any], lens: Intrinsics) -> Intrinsics:
 
 
 def _other_lenses(fields: Sequence[str]) -> tuple[str, ...]:
-    """Note that ns-render draws the entries ``fields`` with other intrinsics; no note without entries."""
+    """Return the note that ns-render draws the entries ``fields`` with other intrinsics; no note without entries."""
     if not fields:
         return ()
     count = f" and {len(fields) - 1} more" if len(fields) > 1 else ""
@@ -306,7 +306,7 @@ def _refuse_others(root: Any) -> None:
 
 
 def _entries(root: dict[str, Any], unknown: list[str]) -> list[tuple[str, dict[str, Any]]]:
-    """Field names and entries of a path's cameras; appends names of unknown keys to ``unknown``. Raises InputError.
+    """Return the field names and entries of a path's cameras; appends names of unknown keys to ``unknown``.
 
     If "camera_path" is empty and there is one keyframe, this is the camera: the viewer writes none then.
     """
@@ -342,7 +342,7 @@ def _entries(root: dict[str, Any], unknown: list[str]) -> list[tuple[str, dict[s
 
 
 def _keyframe_matrix(value: Any, field: str) -> Any:
-    """The numbers of a keyframe's matrix, row by row.
+    """Return the numbers of a keyframe's matrix, row by row.
 
     Nerfstudio's viewer writes a list of rows; the one before 1.0 and the Blender add-on write a text with the list of
     three.js, which is column by column.
@@ -360,7 +360,7 @@ def _keyframe_matrix(value: Any, field: str) -> Any:
 
 
 def checked_side(value: Any, name: str) -> int:
-    """A number of pixels, from the field ``name``. Raises InputError where it is no integer from 1 to `SIDE_LIMIT`."""
+    """Return a number of pixels from field ``name``. Raises InputError outside of 1 to `SIDE_LIMIT`."""
     # The viewer may write 1080.0.
     if not is_number(value) or value != math.floor(value) or not 1 <= value <= SIDE_LIMIT:
         problem = "missing" if value is None else f"found {show(value)}"
@@ -369,7 +369,7 @@ def checked_side(value: Any, name: str) -> int:
 
 
 def _focal(entry: dict[str, Any], root: dict[str, Any], field: str, height: int) -> float:
-    """Focal length in pixels from the entry's vertical field of view, or from the path's default."""
+    """Return the focal length in pixels from the entry's vertical field of view, or from the path's default."""
     field = f"{field}.fov"
     fov = entry.get("fov")
     if "fov" in entry and fov is None and field.startswith("camera_path"):
@@ -384,7 +384,7 @@ def _focal(entry: dict[str, Any], root: dict[str, Any], field: str, height: int)
 
 
 def focal_length(fov: Any, height: int, field: str) -> float:
-    """Focal length in pixels of a vertical field of view in degrees, from the field ``field``.
+    """Return the focal length in pixels of a vertical field of view in degrees, from the field ``field``.
 
     Raises InputError: it is no angle above 0 and below 180 degrees with a float32 focal length.
     """
@@ -401,7 +401,7 @@ def focal_length(fov: Any, height: int, field: str) -> float:
 
 
 def checked_pose(value: Any, field: str) -> NDArray[np.float64]:
-    """A camera-to-world pose [3, 4] float64 from 16 numbers in rows, flat or nested, from the field ``field``.
+    """Return a camera-to-world pose [3, 4] float64 from 16 numbers in rows, flat or nested, from the field ``field``.
 
     Raises InputError: it is no rigid, right-handed pose of numbers that float32 can hold.
     """

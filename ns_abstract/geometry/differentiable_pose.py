@@ -28,7 +28,7 @@ class _Tensors:
 
 
 def differentiable_pose(pose_set: PoseBox) -> Callable[[Tensor], Tensor]:
-    """Differentiable version of `PoseBox.pose`: from parameter values [d] to camera-to-world [3, 4], float64."""
+    """Return `PoseBox.pose` as a differentiable function from values [d] to camera-to-world [3, 4], float64."""
 
     def pose(values: Tensor) -> Tensor:
         tensors = _Tensors(values, pose_set.box.dimensions)

@@ -38,7 +38,7 @@ _TUNING = EnclosingTuning()
 
 
 def enclosing_box(cell: ParameterBox, whole: ParameterBox, motion: np.ndarray) -> ParameterBox | None:
-    """Box around a cell, inside the set ``whole``, about two to eight times wider along each parameter (Q5).
+    """Return the box around a cell, inside the set ``whole``, two to eight times wider along each parameter (Q5).
 
     Its ends lie on a dyadic grid of ``whole``, so that neighbouring cells of similar widths share it. ``motion`` [d]
     are pixels by which the picture moves over each range of ``whole``. None: it would move too much over the box.
@@ -48,7 +48,7 @@ def enclosing_box(cell: ParameterBox, whole: ParameterBox, motion: np.ndarray) -
 
 
 def shared_box(box: ParameterBox, whole: ParameterBox, motion: np.ndarray) -> ParameterBox | None:
-    """Wider box around an enclosing ``box``, over which the picture moves about equally along each parameter (Q5).
+    """Return the wider box around an enclosing ``box``, over which parameters move the picture about equally (Q5).
 
     Enclosing boxes are as long and narrow as cells; a few shared boxes hold all of them. ``whole``, ``motion``: see
     `enclosing_box`. None: the picture would move too much, or the box is no wider.
@@ -70,7 +70,7 @@ def shared_box(box: ParameterBox, whole: ParameterBox, motion: np.ndarray) -> Pa
 
 
 def box_of_motion(cell: ParameterBox, whole: ParameterBox, motion: np.ndarray, pixels: float) -> ParameterBox | None:
-    """Box around a cell, inside ``whole``, over which the picture moves by about ``pixels`` along each parameter.
+    """Return the box around a cell, inside ``whole``, in which each parameter moves the picture by about ``pixels``.
 
     It is at least as much wider than the cell as `enclosing_box` (``motion``: see there). None: it leaves ``whole``.
     """
@@ -108,7 +108,7 @@ class EnclosingBoxes(Generic[_Value]):
         self._lock = threading.Lock()
 
     def around(self, cell: ParameterBox) -> _Value | None:
-        """Value of the box around a cell; None: the cell reaches beyond the set."""
+        """Return the value of the box around a cell; None: the cell reaches beyond the set."""
         box = box_of_motion(cell, self._whole, self._motion, _TUNING.shared_motion)
         if box is None:
             return None
@@ -127,7 +127,7 @@ class EnclosingBoxes(Generic[_Value]):
 
 
 def _levels(cell: ParameterBox, whole: ParameterBox) -> list[int]:
-    """[d] most halvings of ``whole`` along each parameter that leave it at least as wide as the cell."""
+    """Return, by parameter [d], the most halvings of ``whole`` that leave it at least as wide as the cell."""
     widths = zip(cell.lower, cell.upper, whole.lower, whole.upper, strict=True)
     return [
         max(0, math.floor(math.log2((high - low) / (past - first)) + _TUNING.spare)) if past > first else 0
@@ -136,7 +136,7 @@ def _levels(cell: ParameterBox, whole: ParameterBox) -> list[int]:
 
 
 def _aligned(cell: ParameterBox, whole: ParameterBox, levels: Sequence[int]) -> ParameterBox:
-    """Smallest box around the cell with ends on (or just beyond) lines of ``whole`` halved ``levels`` [d] times."""
+    """Return the smallest box around the cell whose ends are lines of ``whole`` halved ``levels`` [d] times."""
     box = cell
     for axis, level in enumerate(levels):
         low, high = whole.lower[axis], whole.upper[axis]
@@ -152,7 +152,7 @@ def _aligned(cell: ParameterBox, whole: ParameterBox, levels: Sequence[int]) -> 
 
 
 def _useful(box: ParameterBox, cell: ParameterBox, whole: ParameterBox, motion: np.ndarray) -> ParameterBox | None:
-    """``box`` if it is not the cell and the picture moves by at most `EnclosingTuning.motion` over it, else None."""
+    """Return ``box`` if it is not the cell and the picture moves by at most `EnclosingTuning.motion`, else None."""
     widths = zip(box.lower, box.upper, whole.lower, whole.upper, motion.tolist(), strict=True)
     moved = [
         pixels * (past - first) / (high - low) if high > low else pixels for first, past, low, high, pixels in widths

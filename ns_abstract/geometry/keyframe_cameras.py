@@ -28,7 +28,7 @@ class KeyframeCamera:
 
 
 def look_at(eye: ArrayLike, target: ArrayLike, up: ArrayLike = (0.0, 0.0, 1.0)) -> NDArray[np.float64]:
-    """The camera-to-world matrix [4, 4] of a camera at ``eye`` that looks at ``target`` (OpenGL axes)."""
+    """Return the camera-to-world matrix [4, 4] of a camera at ``eye`` that looks at ``target`` (OpenGL axes)."""
     back = np.asarray(eye, np.float64) - np.asarray(target, np.float64)
     back /= np.linalg.norm(back)
     right = np.cross(np.asarray(up, np.float64), back)
@@ -42,7 +42,7 @@ def look_at(eye: ArrayLike, target: ArrayLike, up: ArrayLike = (0.0, 0.0, 1.0)) 
 def around(
     target: ArrayLike, azimuth: float, elevation: float, distance: float, *, height: int = 200, width: int = 200
 ) -> KeyframeCamera:
-    """A view of ``target`` from ``distance``; angles in degrees, azimuth from +x towards +y, z up."""
+    """Return a view of ``target`` from ``distance``; angles in degrees, azimuth from +x towards +y, z up."""
     a, e = np.deg2rad([azimuth, elevation])
     eye = np.asarray(target) + distance * np.array([np.cos(e) * np.cos(a), np.cos(e) * np.sin(a), np.sin(e)])
     return KeyframeCamera(look_at(eye, target), height=height, width=width)
@@ -51,7 +51,7 @@ def around(
 def path_json(
     views: Sequence[KeyframeCamera], *, seconds: float = 2.0, fps: int = 24, perturbation: dict[str, Any] | None = None
 ) -> dict[str, Any]:
-    """A camera path with one frame and one keyframe per view; all ``views`` are of the first one's size.
+    """Return a camera path with one frame and one keyframe per view; all ``views`` are of the first one's size.
 
     ``seconds`` is the duration that ns-render gives the video, ``fps`` the frame rate that the viewer shows;
     ``perturbation`` is stored under "perturbation" when given.
@@ -92,6 +92,6 @@ def path_json(
 
 
 def ring(target: ArrayLike, distance: float, count: int = 10, size: int = 200) -> list[KeyframeCamera]:
-    """``count`` views of ``target`` on a circle around it, alternately 15 and 30 degrees above."""
+    """Return ``count`` views of ``target`` on a circle around it, alternately 15 and 30 degrees above."""
     turns = [360.0 * k / count for k in range(count)]
     return [around(target, a, 15.0 + 15.0 * (k % 2), distance, height=size, width=size) for k, a in enumerate(turns)]

@@ -52,7 +52,7 @@ class MotionField:
     side: int
 
     def cells(self, counts: np.ndarray) -> MotionCells:
-        """`MotionCells` of this motion, ``counts`` [2] of them along the axes."""
+        """Return `MotionCells` of this motion, ``counts`` [2] of them along the axes."""
         size = np.abs(self.pixels).sum(axis=-1, keepdims=True)
         rows = MOTION_SCALE * self.pixels / np.where(size > 0.0, size, 1.0)
         motion = np.ascontiguousarray(np.concatenate([rows, _inverse(rows)], axis=1))
@@ -65,12 +65,12 @@ class MotionField:
 
 
 def square_numbers(columns: np.ndarray, rows: np.ndarray, width: int, side: int) -> np.ndarray:
-    """Row-major numbers of the squares of ``side`` pixels that hold given pixels of a picture ``width`` pixels wide."""
+    """Return row-major numbers of the squares of ``side`` pixels that hold pixels of a picture ``width`` wide."""
     return rows // side * -(-width // side) + columns // side
 
 
 def _inverse(rows: Float64Array) -> Float64Array:
-    """Transposed, regularised pseudo-inverses [n, 2, d] of matrices ``rows`` [n, 2, d]."""
+    """Return the transposed, regularised pseudo-inverses [n, 2, d] of matrices ``rows`` [n, 2, d]."""
     products = rows @ rows.swapaxes(1, 2)
     trace = np.trace(products, axis1=1, axis2=2)[:, None, None]
     return np.linalg.solve(products + (MotionCellTuning.regular * trace + (trace == 0.0)) * np.eye(2), rows)

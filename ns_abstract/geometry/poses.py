@@ -41,7 +41,7 @@ def _cross_matrix(axis: Float64Array) -> Float64Array:
 
 
 def rotation_about(axis: Float64Array, angle: float) -> Float64Array:
-    """[3, 3] right-handed rotation by ``angle`` (radians) about the unit vector ``axis`` (Rodrigues)."""
+    """Return the [3, 3] right-handed rotation by ``angle`` (radians) about the unit vector ``axis`` (Rodrigues)."""
     k = _cross_matrix(np.asarray(axis, np.float64))
     return np.eye(3) + np.sin(angle) * k + (1.0 - np.cos(angle)) * (k @ k)
 
@@ -69,13 +69,13 @@ def _check_segment(camera: PinholeCamera, following: PinholeCamera) -> None:
 
 
 def orthonormal(matrix: Float64Array) -> Float64Array:
-    """The rotation nearest to ``matrix`` [3, 3]."""
+    """Return the rotation nearest to ``matrix`` [3, 3]."""
     u, _, vt = np.linalg.svd(matrix)
     return u @ np.diag([1.0, 1.0, np.sign(np.linalg.det(u @ vt))]) @ vt
 
 
 def axis_angle(rotation: Float64Array) -> tuple[Float64Array, float]:
-    """Unit axis [3] and angle in [0, pi] of a rotation [3, 3].
+    """Return the unit axis [3] and angle in [0, pi] of a rotation [3, 3].
 
     By way of the quaternion, from its largest component (Shepperd 1978), which is accurate for every
     angle, a half turn included.
@@ -148,7 +148,7 @@ class PoseBox:
     def around(
         cls, camera: PinholeCamera, perturbation: Perturbation, following: PinholeCamera | None = None
     ) -> PoseBox:
-        """The pose set of one keyframe; ``following`` is the next one, used if the sweep is over segments."""
+        """Return the pose set of one keyframe; ``following`` is the next one, used if the sweep is over segments."""
         ranges: dict[str, tuple[str, tuple[float, float]]] = {}
         for name in TRANSLATIONS:
             ranges[name] = ("normalised units", perturbation.translation.get(name, (0.0, 0.0)))
@@ -180,7 +180,7 @@ class PoseBox:
         return replace(self, box=self.box.without(COLOR_SHIFTS))
 
     def registered(self, names: tuple[str, ...], radius: float) -> PoseBox:
-        """The same pose set relative to a scene that is shifted or turned as a whole (design.md, P3).
+        """Return the same pose set relative to a scene that is shifted or turned as a whole (design.md, P3).
 
         ``names``: `SCENE_SHIFTS`, normalised units; or `SCENE_TURNS`, radians: the scene is turned about the world axes
         through the origin, z first and x last. These parameters follow the set's own, each from -``radius`` to
@@ -193,7 +193,7 @@ class PoseBox:
         return replace(self, box=ParameterBox(*(a + b for a, b in zip(parts, more, strict=True))))  # pyright: ignore[reportArgumentType]
 
     def sheared(self, shear: dict[str, dict[str, float]]) -> PoseBox:
-        """The same pose set in sheared parameters: rotation = parameter + sum of factor * other (design.md, P2).
+        """Return the same pose set in sheared parameters: rotation = parameter + sum of factor * other (design.md, P2).
 
         The box holds parameters of every pose of the set and, near its ends, of none (`feasible`); for the latter,
         `pose` takes the nearest angle of the set.
@@ -211,7 +211,7 @@ class PoseBox:
         return replace(self, box=box, shear=shear)
 
     def within(self, box: ParameterBox) -> PoseBox:
-        """Pose set of a ``box`` of the same parameters (design.md, V15); not for sheared parameters."""
+        """Return the pose set of a ``box`` of the same parameters (design.md, V15); not for sheared parameters."""
         ranges = dict(self.perturbation.rotation)
         for name, low, high in zip(box.names, box.lower, box.upper, strict=True):
             if name in ROTATIONS:
@@ -219,7 +219,7 @@ class PoseBox:
         return replace(self, box=box, perturbation=replace(self.perturbation, rotation=ranges))
 
     def feasible(self, box: ParameterBox) -> ParameterBox | None:
-        """Smaller box that holds all parameters of ``box`` of poses of the set; None: there are none (P2)."""
+        """Return smaller box that holds all parameters of ``box`` of poses of the set; None: there are none (P2)."""
         for name, factors in self.shear.items():
             low, high = self.perturbation.rotation[name]
             terms = {box.names.index(name): 1.0} | {box.names.index(other): f for other, f in factors.items()}
@@ -251,7 +251,7 @@ class PoseBox:
         return first, start[:, 3], axis, angle, end[:, 3] - start[:, 3]
 
     def pose(self, values: Float64Array, beyond: bool = False) -> Float64Array:
-        """Camera-to-world [3, 4] at parameter values [d] (physical units, in the order of ``box``).
+        """Return the camera-to-world [3, 4] at parameter values [d] (physical units, in the order of ``box``).
 
         Sheared rotations outside of the set are clipped to it, unless ``beyond`` is true.
         """
@@ -282,7 +282,7 @@ class PoseBox:
         return np.concatenate([rotation, position[:, None]], axis=1)
 
     def enclosure(self, box: ParameterBox, order: int = 1) -> PoseForms:
-        """Forms that enclose the transform of every pose of ``box`` (design.md, P1)."""
+        """Return forms that enclose the transform of every pose of ``box`` (design.md, P1)."""
         rotation, position = self.evaluated(box, Basis(self.box.dimensions, order), FormArray, cos_sin)
         m = rotation.basis.monomials
         rounding, shift = self._rounding
@@ -294,7 +294,7 @@ class PoseBox:
         return PoseForms(world_to_camera, offset, position, origin)
 
     def taylor(self, box: ParameterBox, degree: int) -> tuple[TaylorArray, TaylorArray]:
-        """Taylor models of the camera-to-world rotation [3, 3] and position [3] over ``box`` (P1, N1)."""
+        """Return Taylor models of the camera-to-world rotation [3, 3] and position [3] over ``box`` (P1, N1)."""
         basis = TaylorBasis(self.box.dimensions, degree)
         rotation, position = self.evaluated(box, basis, TaylorArray, taylor_cos_sin)
         rounding, shift = self._rounding
@@ -323,7 +323,7 @@ class PoseBox:
         trigonometry: Callable[[Any], tuple],
         array: Callable[[Float64Array], Any] = lambda numbers: numbers,
     ) -> tuple[Any, Any]:
-        """Camera-to-world rotation [3, 3] and position [3] over ``box`` in an arithmetic ``kind`` (forms, tensors).
+        """Return the camera-to-world rotation [3, 3] and position [3] over ``box``, in the arithmetic of ``kind``.
 
         The rounding errors of `pose` are not charged. ``kind`` has ``constant`` and ``parameter`` with the ``basis``;
         ``trigonometry`` returns cosine and sine; ``array`` converts plain numbers for operations with ``kind``.
@@ -381,7 +381,7 @@ class PoseBox:
         return rotation, position
 
     def world_to_camera(self, values: Float64Array, beyond: bool = False) -> tuple[Float64Array, Float64Array]:
-        """Rotation [3, 3] (OpenCV axes) and camera position [3] at parameter values [d]; see `pose`."""
+        """Return the rotation [3, 3] (OpenCV axes) and camera position [3] at parameter values [d]; see `pose`."""
         pose = self.pose(values, beyond)
         return np.ascontiguousarray(pose[:, :3].T * _FLIP[:, None]), pose[:, 3].copy()
 

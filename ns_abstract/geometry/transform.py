@@ -39,7 +39,7 @@ class DataparserTransform:
         return self.scale if abs(length - 1.0) <= InputTuning.rotation else self.scale * length
 
     def pose(self, camera_to_world: NDArray[np.float64]) -> NDArray[np.float64]:
-        """A pose [4, 4] of the data set in the run's frame, [3, 4]."""
+        """Return a pose [4, 4] of the data set in the run's frame, [3, 4]."""
         moved = self.matrix @ camera_to_world
         moved[:, 3] *= self.scale
         return moved

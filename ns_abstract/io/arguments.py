@@ -23,7 +23,7 @@ _MOST_WORKERS = 1 << 16
 
 
 def float64_of(value: Any) -> float:
-    """``value`` as float64, infinite where it is too large; NaN where it is no number (bool is none)."""
+    """Return ``value`` as float64, infinite where it is too large; NaN where it is no number (bool is none)."""
     if isinstance(value, bool) or not isinstance(value, Real):
         return math.nan
     try:
@@ -33,7 +33,7 @@ def float64_of(value: Any) -> float:
 
 
 def positive(value: Any, field: str) -> float:
-    """``value`` as a number above 0 and below infinity, from the argument or option ``field``.
+    """Return ``value`` as a number above 0 and below infinity, from the argument or option ``field``.
 
     Raises InputError: it is none.
     """
@@ -44,7 +44,7 @@ def positive(value: Any, field: str) -> float:
 
 
 def at_least(value: Any, least: float, field: str) -> float:
-    """``value`` as a finite number that is no smaller than ``least``. Raises InputError where it is none."""
+    """Return ``value`` as a finite number that is no smaller than ``least``. Raises InputError where it is none."""
     number = float64_of(value)
     if not least <= number < math.inf:
         raise unusable(value, field=field, fix=f"give a number of at least {least:g}")
@@ -52,7 +52,7 @@ def at_least(value: Any, least: float, field: str) -> float:
 
 
 def whole(value: Any, least: int, field: str, most: int | None = None) -> int:
-    """``value`` as an integer from ``least`` to ``most``. Raises InputError where it is none."""
+    """Return ``value`` as an integer from ``least`` to ``most``. Raises InputError where it is none."""
     number = int(value) if isinstance(value, Integral) and not isinstance(value, bool) else None
     if number is None or number < least or (most is not None and number > most):
         limits = f"a whole number of at least {least}" if most is None else f"{least} to {most}"
@@ -61,7 +61,7 @@ def whole(value: Any, least: int, field: str, most: int | None = None) -> int:
 
 
 def flag(value: Any, field: str) -> bool:
-    """``value`` as a bool, from the argument ``field``.
+    """Return ``value`` as a bool, from the argument ``field``.
 
     Raises InputError: it is none; texts such as "no" would count as true.
     """
@@ -75,7 +75,7 @@ def flag(value: Any, field: str) -> bool:
 
 
 def array_of(value: Any, dtype: DTypeLike | None = None) -> np.ndarray | None:
-    """``value`` as a NumPy array; None if it cannot be converted, such as a tensor that requires gradients."""
+    """Return ``value`` as a NumPy array; None if it cannot be converted, such as a tensor that requires gradients."""
     import numpy as np
 
     try:
@@ -85,14 +85,14 @@ def array_of(value: Any, dtype: DTypeLike | None = None) -> np.ndarray | None:
 
 
 def one_of(value: Any, names: Sequence[str], field: str) -> str:
-    """``value``, which is one of ``names``. Raises InputError where it is none."""
+    """Return ``value``, which is one of ``names``. Raises InputError where it is none."""
     if not (isinstance(value, str) and value in names):
         raise unusable(value, field=field, fix=f"use {' or '.join(names)}")
     return value
 
 
 def workers_of(value: Any) -> int:
-    """``value`` as a number of processes. Raises InputError where no machine has so many."""
+    """Return ``value`` as a number of processes. Raises InputError where no machine has so many."""
     return whole(value, 1, "workers", _MOST_WORKERS)
 
 
@@ -103,7 +103,7 @@ def callback(value: Any) -> None:
 
 
 def plain(value: Any, depth: int = 0) -> Any:
-    """``value`` as a file of JSON has it: numpy's numbers and arrays, and tuples, become numbers and lists.
+    """Return ``value`` as a file of JSON has it: numpy's numbers and arrays, and tuples, become numbers and lists.
 
     ``depth``: how many lists and mappings hold it. Raises InputError where these are more than any file needs.
     """
@@ -120,7 +120,7 @@ def plain(value: Any, depth: int = 0) -> Any:
 
 
 def file_path(value: Any, field: str) -> Path:
-    """``value`` as a path. Raises InputError where it can name no file; the file may be absent."""
+    """Return ``value`` as a path. Raises InputError where it can name no file; the file may be absent."""
     if not isinstance(value, str | os.PathLike):
         raise unusable(value, field=field, fix="give the path of a file")
     try:

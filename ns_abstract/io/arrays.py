@@ -38,7 +38,7 @@ class Archive:
             self.declared[name] = self._header(member)
 
     def _header(self, member: zipfile.ZipInfo) -> tuple[tuple[int, ...], np.dtype]:
-        """Shape and dtype of an array of the archive. Raises InputError if its data have another size."""
+        """Return the shape and dtype of an array of the archive. Raises InputError if its data have another size."""
         with self._archive.open(member) as stream:
             version = np.lib.format.read_magic(stream)
             if version not in ((1, 0), (2, 0)):
@@ -54,7 +54,7 @@ class Archive:
         return shape, kind
 
     def read(self, name: str) -> np.ndarray:
-        """The array ``name``; check its size in ``declared`` first."""
+        """Return the array ``name``; check its size in ``declared`` first."""
         with self._archive.open(f"{name}.npy") as stream:
             return np.lib.format.read_array(stream, allow_pickle=False, max_header_size=_HEADER_LIMIT)
 

@@ -14,7 +14,7 @@ _recorded: ContextVar[dict[str, str] | None] = ContextVar("recorded", default=No
 
 @contextmanager
 def recorded(digests: dict[str, str]) -> Iterator[None]:
-    """Inside, the SHA-256 of every small file that is read goes into ``digests``, by absolute path."""
+    """Return a context in which the SHA-256 of every small file read goes into ``digests``, by absolute path."""
     token = _recorded.set(digests)
     try:
         yield
@@ -30,5 +30,5 @@ def record(path: Path, digest: Callable[[], hashlib._Hash]) -> None:
 
 
 def key(path: str | os.PathLike[str]) -> str:
-    """Absolute path, under which a file's SHA-256 is stored."""
+    """Return the absolute path, under which a file's SHA-256 is stored."""
     return os.path.abspath(path)

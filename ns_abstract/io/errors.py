@@ -6,7 +6,7 @@ from pathlib import Path
 
 
 def visible(text: str) -> str:
-    """``text`` without characters that a terminal acts upon; Python's escapes stand in their place."""
+    """Return ``text`` without characters that a terminal acts upon; Python's escapes stand in their place."""
     if text.isprintable():
         return text
     return "".join(c if c.isprintable() else ascii(c)[1:-1] for c in text)
@@ -44,7 +44,7 @@ class InputError(ValueError):
         super().__init__(visible(" ".join(text.split())))
 
     def within(self, file: str | Path) -> InputError:
-        """The same error with ``file`` filled in where it was unknown."""
+        """Return the same error with ``file`` filled in where it was unknown."""
         if self.file is not None:
             return self
         return InputError(self.problem, fix=self.fix, file=file, field=self.field)

@@ -15,7 +15,7 @@ Fail = Callable[[str, str, str], InputError]
 
 
 def fail(name: str, problem: str, fix: str) -> InputError:
-    """The error of the field ``name``."""
+    """Return an InputError of the field ``name``."""
     return InputError(problem, field=name, fix=fix)
 
 
@@ -27,7 +27,7 @@ def known(value: Mapping[str, Any], keys: Collection[str], prefix: str, fail: Fa
 
 
 def interval(value: object, name: str, fail: Fail, *, symmetric: bool = True) -> Range:
-    """An interval [low, high]; if ``symmetric``, a number r >= 0 means [-r, r]."""
+    """Return an interval [low, high]; if ``symmetric``, a number r >= 0 means [-r, r]."""
     if symmetric and is_number(value):
         if value < 0:  # pyright: ignore[reportOperatorIssue]
             raise fail(name, f"found {show(value)}", "a radius is not negative; write [low, high] for an interval")
@@ -42,7 +42,7 @@ def interval(value: object, name: str, fail: Fail, *, symmetric: bool = True) ->
 
 
 def vector(value: object, name: str, fail: Fail) -> Vector:
-    """``value``, a list of three finite numbers, as floats; otherwise raises the error of the field ``name``."""
+    """Return ``value``, a list of three finite numbers, as floats; raises the error of the field ``name`` otherwise."""
     if not (isinstance(value, list) and len(value) == 3 and all(is_number(v) for v in value)):
         raise fail(name, f"found {show(value)}", "write three finite numbers")
     return float(value[0]), float(value[1]), float(value[2])

@@ -95,7 +95,7 @@ def claim(folder: Path) -> LockedFolder:
 
 
 def first_command(folder: Path) -> list[str] | None:
-    """Command line, as words, of the run that began the results in a folder's report.json; None: not readable."""
+    """Return the words of the command that began the results in a folder's report.json; None: not readable."""
     try:
         document = load_json(folder / "report.json", "report", _REPORT_LIMIT)
     except InputError:

@@ -60,7 +60,7 @@ _BRACKET = re.compile(r'[\[\]{}]|"[^"\\]*(?:\\.[^"\\]*)*"', re.DOTALL)
 
 
 def show(value: Any) -> str:
-    """Short one-line text of a value for error messages."""
+    """Return a short one-line text of a value for error messages."""
     if isinstance(value, bool) or value is None:
         return {True: "true", False: "false", None: "null"}[value]
     if isinstance(value, str):
@@ -94,7 +94,7 @@ def is_moderate(value: Any) -> TypeGuard[int | float]:
 
 
 def file_size(path: Path, what: str, fix: str | None = None) -> int:
-    """Size in bytes of a regular file.
+    """Return the size in bytes of a regular file.
 
     ``what``: what the file should be, for messages, such as "checkpoint". ``fix``: what to do when it is absent. Raises
     InputError where the file is absent, not accessible or not a regular file.
@@ -117,12 +117,12 @@ def file_size(path: Path, what: str, fix: str | None = None) -> int:
 
 
 def unusable(value: Any, *, field: str, fix: str, file: Path | None = None) -> InputError:
-    """An InputError which states that ``field`` holds the unusable ``value``."""
+    """Return an InputError which states that ``field`` holds the unusable ``value``."""
     return InputError(f"found {show(value)}", file=file, field=field, fix=fix)
 
 
 def file_beside(folder: Path, name: str, field: str = "") -> Path:
-    """Path of the file ``name``, relative to ``folder``, that a file there names in ``field``.
+    """Return the path of the file ``name``, relative to ``folder``, that a file there names in ``field``.
 
     Raises InputError: the name leads out of the folder, also through links.
     """
@@ -138,7 +138,7 @@ def file_beside(folder: Path, name: str, field: str = "") -> Path:
 
 
 def read_bytes(path: Path, what: str, limit: int) -> bytes:
-    """Contents of a regular file of at most ``limit`` bytes.
+    """Return contents of a regular file of at most ``limit`` bytes.
 
     Raises InputError: as :func:`file_size`, or the file is larger than ``limit`` or unreadable.
     """
@@ -164,7 +164,7 @@ def read_bytes(path: Path, what: str, limit: int) -> bytes:
 
 
 def read_text(path: Path, what: str, limit: int) -> str:
-    """Contents of a UTF-8 file of at most ``limit`` bytes; a byte-order mark is dropped.
+    """Return contents of a UTF-8 file of at most ``limit`` bytes; a byte-order mark is dropped.
 
     Raises InputError: as :func:`read_bytes`, or the file is empty or not UTF-8.
     """

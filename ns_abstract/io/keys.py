@@ -61,7 +61,7 @@ class KeyTable:
         return {".".join(names[:k]) for names in parts for k in range(1, len(names))}
 
     def find(self, name: str) -> Key | None:
-        """Entry of the dotted ``name`` or of the nearest key above it; None if the table has none."""
+        """Return the entry of the dotted ``name`` or of the nearest key above it; None if the table has none."""
         while name not in self._known:
             name, dot, _ = name.rpartition(".")
             if not dot or name in self._sections:
@@ -71,7 +71,7 @@ class KeyTable:
     def unknown(
         self, section: Mapping[Any, Any], prefix: str = "", mapping: Callable[[Any], Mapping[Any, Any] | None] = _plain
     ) -> list[str]:
-        """The dotted names of keys of ``section`` that are not in the table.
+        """Return the dotted names of keys of ``section`` that are not in the table.
 
         ``mapping``: the mapping that a value holds, or None. Raises InputError where a key has a value that is refused.
         """

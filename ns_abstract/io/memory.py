@@ -30,7 +30,7 @@ def available_memory() -> int | None:
 
 
 def allowed_memory(limit: float | None) -> int:
-    """Bytes that may be taken: ``limit`` in GiB, or most of what is free where it is None.
+    """Return the bytes that may be taken: ``limit`` in GiB, or most of the free memory where it is None.
 
     Raises InputError: it is no positive number.
     """

@@ -36,7 +36,7 @@ class _Read(io.RawIOBase):
 
 
 def unpacked(path: Path, limit: int) -> Iterator[bytes]:
-    """Contents of a .gz file in parts. Raises InputError where it is damaged, or grows past ``limit`` bytes."""
+    """Return contents of a .gz file in parts. Raises InputError where it is damaged, or grows past ``limit`` bytes."""
     total = 0
     file_size(path, "file")
     try:
@@ -70,7 +70,7 @@ class _LimitedReader(io.BufferedReader):
 
 @contextmanager
 def open_zip(path: Path) -> Iterator[zipfile.ZipFile]:
-    """A zip archive, open inside the block.
+    """Return a zip archive, open inside the block.
 
     Raises InputError where its list of members, which zipfile reads whole, is too long. Raises what zipfile raises of
     damaged files.

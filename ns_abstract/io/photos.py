@@ -31,7 +31,7 @@ _ENDINGS = (".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff", ".webp", ".ppm")
 
 
 def read_photo(file: Path, field: str = "--image", *, as_stored: bool = False) -> np.ndarray:
-    """The values [H, W, 3] uint8 of a photo of 8 bits by channel.
+    """Return the values [H, W, 3] uint8 of a photo of 8 bits by channel.
 
     ``as_stored``: ignore the EXIF orientation, as Nerfstudio does for training photos. Otherwise a photo with another
     orientation than 1 is refused. Raises InputError: the file is missing, is no such photo, holds several, or is partly
@@ -43,14 +43,14 @@ def read_photo(file: Path, field: str = "--image", *, as_stored: bool = False) -
 
 
 def photo_size(file: Path, field: str) -> tuple[int, int]:
-    """Height and width of a photo by its head; raises InputError where that shows that `read_photo` refuses it."""
+    """Return a photo's height and width by its head; InputError where that shows that `read_photo` refuses it."""
     with _opened(file, field) as image:
         _refuse_kind(image, file, field)
         return image.height, image.width
 
 
 def sequence_photos(folder: Path, field: str = "--image-sequence") -> list[Path]:
-    """The pictures of a folder, in the order of their names, but for hidden ones.
+    """Return the pictures of a folder, in the order of their names, but for hidden ones.
 
     Raises InputError: there is no such folder, it cannot be listed or holds none, one of them is no file, or the
     numbers in the names have another order than the names.
@@ -78,7 +78,7 @@ def sequence_photos(folder: Path, field: str = "--image-sequence") -> list[Path]
 
 
 def missing_photos(photos: Sequence[Path]) -> str | None:
-    """Note on the first gap in the numbers of ``photos``, sorted by name; None: no gap, or no single number."""
+    """Return a note on the first gap in the numbers of ``photos``, sorted by name; None: no gap, or no numbers."""
     parts = [_numbered(photo) for photo in photos]
     if len({len(part) for part in parts}) > 1:
         return None
@@ -94,12 +94,12 @@ def missing_photos(photos: Sequence[Path]) -> str | None:
 
 
 def _numbered(photo: Path) -> list[Any]:
-    """Parts of a photo's name: text at even places, numbers at odd ones."""
+    """Return the parts of a photo's name: text at even places, numbers at odd ones."""
     return [int(part) if k % 2 else part for k, part in enumerate(re.split(r"([0-9]+)", photo.name.casefold()))]
 
 
 def read_mask(file: Path, size: tuple[int, int], field: str = "--mask") -> np.ndarray:
-    """Which pixels [H, W] of a mask are white; it has to be black and white.
+    """Return the white pixels [H, W], as bools, of a mask, which has to be black and white.
 
     Raises InputError: the file is missing, of another size, or holds other values.
     """
@@ -138,7 +138,7 @@ def other_bits(image: Any) -> bool:
 
 @contextmanager
 def _opened(file: Path, field: str | None, as_stored: bool = False, png: bytes | None = None) -> Iterator[Any]:
-    """An opened picture of 8 bits by channel, for a ``with`` block; any error in it becomes an InputError of the file.
+    """Return a context of an opened picture of 8 bits by channel; any error in it becomes an InputError of the file.
 
     ``png``: the file's content, if it must be a .png.
     """
@@ -177,7 +177,7 @@ def _refuse_kind(image: Any, file: Path, field: str) -> None:
 
 
 def _opaque(image: Any, file: Path, field: str | None) -> Any:
-    """An opened image as RGB or RGBA of full opacity. Raises InputError where a pixel is transparent."""
+    """Return an opened image as RGB or RGBA of full opacity. Raises InputError where a pixel is transparent."""
     if image.mode not in ("RGBA", "PA", "LA") and "transparency" not in image.info:
         return image.convert("RGB")
     image = image.convert("RGBA")

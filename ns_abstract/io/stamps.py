@@ -15,7 +15,7 @@ _CHUNK = 2**20
 
 
 def file_stamp(path: str | os.PathLike[str]) -> dict[str, Any]:
-    """Identity of a file by content: ``name``, ``bytes`` and ``sha256``; a moved file keeps it.
+    """Return the identity of a file by content: ``name``, ``bytes`` and ``sha256``; a moved file keeps it.
 
     Raises InputError: the file is absent or cannot be read.
     """

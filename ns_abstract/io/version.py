@@ -16,7 +16,7 @@ ADVISORY = "docs/advisories.md lists what earlier versions got wrong"
 
 
 def computed_by() -> dict[str, Any]:
-    """The part of a fingerprint that names this version of the package and its rules for abstract images."""
+    """Return the part of a fingerprint that names this version of the package and its rules for abstract images."""
     return {"ns_abstract": VERSION, "render_rules": RENDER_RULES}
 
 

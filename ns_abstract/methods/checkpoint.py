@@ -71,7 +71,7 @@ class StoredTensor:
     storage: NDArray[Any] | None = None
 
     def float32(self, file: Path, field: str, finite: bool = True) -> NDArray[np.float32]:
-        """Its values, copied out of the file.
+        """Return the tensor's values, copied out of the file.
 
         ``finite``: whether values that are not finite are refused. Raises InputError: not a dense tensor of float16,
         bfloat16, float32 or float64, or a value is not finite in float32.
@@ -95,7 +95,7 @@ class StoredTensor:
 
 
 def to_float32(value: Any, file: Path, field: str, finite: bool = True) -> NDArray[np.float32]:
-    """`StoredTensor.float32` of what a checkpoint holds under ``field``; arrays of float32 are checked alone."""
+    """Return float32 values of an entry ``field`` of a checkpoint; arrays of float32 are checked alone."""
     if isinstance(value, np.ndarray) and value.dtype == np.float32:
         if finite:
             require_finite(value, file, field)
@@ -146,7 +146,7 @@ def read_checkpoint(path: Path) -> Any:
 
 
 def _validated_pickle_member(archive: zipfile.ZipFile, path: Path, size: int) -> zipfile.ZipInfo:
-    """The pickle of an archive that torch.save wrote."""
+    """Return the member that holds the pickle of an archive that torch.save wrote."""
     members = archive.infolist()
     names = Counter(member.filename.casefold() for member in members)
     pickles = [m for m in members if m.filename.endswith("/data.pkl")]
@@ -183,14 +183,14 @@ class _Storages:
         self._found: dict[tuple[str, str], NDArray[Any]] = {}
 
     def storage(self, pid: Any) -> _Storage:
-        """torch.serialization.persistent_id: ("storage", type, key, device, number of values)."""
+        """Return the storage of a persistent_id of torch: ("storage", type, key, device, number of values)."""
         kind, storage, key, _device, count = pid
         if kind != "storage" or storage not in _STORAGES or not isinstance(count, int):
             raise ValueError("a storage of an unknown type")
         return _Storage(storage, self._values(storage, str(key), count))
 
     def _values(self, kind: str, key: str, count: int) -> NDArray[Any]:
-        """``count`` values of a storage, a read-only view of the mapped file."""
+        """Return ``count`` values of a storage, a read-only view of the mapped file."""
         if (kind, key) not in self._found:
             member = self._archive.getinfo(f"{self._folder}data/{key}")
             self._found[kind, key] = np.frombuffer(
@@ -213,7 +213,7 @@ class _Storages:
         return self._bytes
 
     def _start(self, member: zipfile.ZipInfo) -> int:
-        """Where a member's bytes begin: after the local header, whose lengths are its own (APPNOTE.TXT, 4.3.7)."""
+        """Return the offset of a member's bytes, behind its local header (APPNOTE.TXT, 4.3.7)."""
         at = member.header_offset
         name, extra = struct.unpack("<HH", self._file()[at + 26 : at + 30])
         return at + 30 + name + extra
@@ -226,7 +226,7 @@ class _Storage:
 
 
 def _mapping(*items: Any) -> dict[Any, Any]:
-    """A mapping with an order, or of counts."""
+    """Return an empty dictionary in place of an ordered one, or of counts."""
     if len(items) > 1 or not all(isinstance(part, dict) for part in items):
         raise ValueError("a mapping of other objects")
     return dict(*items)
@@ -237,7 +237,7 @@ def _nothing(*_arguments: Any) -> Placeholder:
 
 
 def _sizes(numbers: Any) -> tuple[int, ...]:
-    """A tensor's sizes or strides. ValueError: other objects, or more than numpy's arrays have."""
+    """Return a tensor's sizes or strides. ValueError: other objects, or more than numpy's arrays have."""
     if not isinstance(numbers, (list, tuple)) or len(numbers) > _MOST_DIMENSIONS:
         raise ValueError("a tensor of other or too many dimensions")
     if not all(type(n) is int and 0 <= n < 2**62 for n in numbers):
@@ -248,7 +248,7 @@ def _sizes(numbers: Any) -> tuple[int, ...]:
 def _tensor(
     storage: Any, offset: Any, shape: Any, strides: Any, _grad: Any = None, _hooks: Any = None, metadata: Any = None
 ) -> StoredTensor:
-    """torch._utils._rebuild_tensor_v2."""
+    """Return the tensor of a call of torch._utils._rebuild_tensor_v2."""
     shape, strides = _sizes(shape), _sizes(strides)
     (offset,) = _sizes((offset,))
     if not isinstance(storage, _Storage) or len(shape) != len(strides):
@@ -264,12 +264,12 @@ def _tensor(
 
 
 def _parameter(data: Any, *_rest: Any) -> Any:
-    """torch._utils._rebuild_parameter."""
+    """Return the tensor of a call of torch._utils._rebuild_parameter."""
     return data
 
 
 def _other(kind: str, place: int, *arguments: Any) -> StoredTensor:
-    """A tensor that is not dense; its shape is argument ``place``."""
+    """Return a placeholder for a tensor that is not dense; its shape is argument ``place``."""
     shape: Any = arguments[1][2] if kind == "sparse" else arguments[place]
     return StoredTensor(kind, _sizes(shape))
 

@@ -36,7 +36,7 @@ class Placeholder:
 
 
 def read_structure(data: bytes, path: Path, names: Mapping[str, Any], persistent: Callable[[Any], Any]) -> Any:
-    """What a pickle, which nobody vouches for, describes.
+    """Return the structure that an untrusted pickle describes, without running anything of it.
 
     Args:
         data: The pickle.
@@ -189,7 +189,7 @@ def _damaged(problem: str) -> NoReturn:
 
 
 def _checked_key(key: Any) -> Any:
-    """A key as it is; ValueError where Python may take long to compare it, or call itself without end."""
+    """Return ``key`` itself; ValueError where Python may compare it for long, or without end."""
     # other numbers can be chosen so that all are looked up at one place
     if type(key) is str or (isinstance(key, int) and -_KEY_LIMIT < key < _KEY_LIMIT):
         return key

@@ -20,12 +20,12 @@ _NEWER = "training in versions after 1.1.5"
 
 
 def _all(why: str, file: str, lines: dict[str, int]) -> tuple[Key, ...]:
-    """Irrelevant keys that have one reason, with the lines that say so."""
+    """Return irrelevant keys with one reason, and the lines of Nerfstudio that show it."""
     return tuple(Key(name, "irrelevant", why.format(name), f"{file}:{line}") for name, line in lines.items())
 
 
 def _absent(why: str, *names: str) -> tuple[Key, ...]:
-    """Irrelevant keys of other versions than 1.1.5."""
+    """Return irrelevant keys of Nerfstudio versions other than 1.1.5."""
     return tuple(Key(name, "irrelevant", why) for name in names)
 
 
@@ -231,7 +231,7 @@ def _check_defaults(run: runs.RunConfig, model: KeyTable) -> None:
 
 
 def check_keys(run: runs.RunConfig, model: KeyTable, refuse_unknown: bool = True) -> tuple[str, ...]:
-    """Notes on the keys of a run's config.yml that nothing is known of, and that are not used.
+    """Return notes on unknown keys of a run's config.yml, which are not used.
 
     ``model``: the keys of ``pipeline.model``: `SPLATFACTO`, `VANILLA_NERF` or `NERFACTO`. ``refuse_unknown``: whether a
     key of ``pipeline.model`` that is in no table is refused, or named in the notes. Raises InputError where a key of

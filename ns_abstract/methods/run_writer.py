@@ -85,7 +85,7 @@ def write_run(
 
 
 def _template(name: str, **values: Any) -> str:
-    """A part of config.yml, in which Python tags say how Nerfstudio rebuilds its configuration."""
+    """Return the text of a part of config.yml, whose Python tags say how Nerfstudio rebuilds its configuration."""
     text = (_TEMPLATES / f"{name}.yml").read_text(encoding="utf-8").rstrip("\n")
     return Template(text).substitute(values)
 
@@ -107,7 +107,7 @@ def write_file(file: Path, data: bytes, *, scratch: Path | None = None) -> None:
 
 
 def background_name(colour: NDArray[np.float32]) -> str:
-    """Nerfstudio's name of a colour, or a list where it has none ("random" renders as a fixed grey)."""
+    """Return Nerfstudio's name of a colour, or a list where it has none ("random" renders as a fixed grey)."""
     names = {"white": (1, 1, 1), "black": (0, 0, 0), "random": (0.1490, 0.1647, 0.2157)}
     for name, value in names.items():
         if np.array_equal(colour, np.asarray(value, np.float32)):
@@ -116,7 +116,7 @@ def background_name(colour: NDArray[np.float32]) -> str:
 
 
 def optimizer_lines(kind: str, eps: str, groups: Mapping[str, tuple[str, tuple[str, str, int] | None]]) -> str:
-    """What config.yml says of the optimizers, from "optimizers:" to the line before "output_dir:".
+    """Return the lines of config.yml on the optimizers, from "optimizers:" to the line before "output_dir:".
 
     ``kind``: "Adam" or "RAdam". ``groups``: learning rate of each group of parameters, and of its schedule the last
     rate, the first one and the steps of warming up; numbers as YAML spells them.
@@ -153,7 +153,7 @@ def optimizer_lines(kind: str, eps: str, groups: Mapping[str, tuple[str, tuple[s
 def checkpoint_bytes(
     model: Mapping[str, ArrayLike], optimizers: Mapping[str, Any], schedulers: Mapping[str, Any]
 ) -> bytes:
-    """A checkpoint of plain tensors, numbers, lists and dictionaries: loads with weights_only.
+    """Return the bytes of a checkpoint of plain tensors, numbers, lists and dictionaries; loads with weights_only.
 
     Args:
         model: Arrays of the model by name; equal objects are stored once.
@@ -173,7 +173,7 @@ def checkpoint_bytes(
 
 
 def _lpips_state(prefix: str) -> dict[str, Any]:
-    """Zeros in place of the LPIPS metric's tensors, whose names begin with ``prefix``."""
+    """Return zeros in place of the LPIPS metric's tensors, whose names begin with ``prefix``."""
     import torch
 
     def zeros(*shape: int) -> torch.Tensor:
@@ -235,7 +235,7 @@ def write_dataset(
 
 
 def _png(image: NDArray[Any]) -> bytes:
-    """An 8-bit RGB PNG of [H, W, 3] values in [0, 1]."""
+    """Return the bytes of an 8-bit RGB PNG of [H, W, 3] values in [0, 1]."""
     from PIL import Image
 
     buffer = io.BytesIO()

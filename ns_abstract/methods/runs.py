@@ -87,7 +87,7 @@ class RunConfig:
     root: dict[str, Any]
 
     def integer(self, name: str, default: int, least: int, most: int | None = None) -> int:
-        """Integer field of ``pipeline.model`` in [least, most]; ``default`` if absent."""
+        """Return the integer field of ``pipeline.model`` in [least, most]; ``default`` if absent."""
         value = self.model.get(name, default)
         fits = isinstance(value, int) and not isinstance(value, bool)
         if not fits or value < least or (most is not None and value > most):
@@ -96,14 +96,14 @@ class RunConfig:
         return value
 
     def choice(self, name: str, default: str, options: tuple[str, ...]) -> str:
-        """Text field of ``pipeline.model`` out of ``options``; ``default`` if absent."""
+        """Return the text field of ``pipeline.model`` out of ``options``; ``default`` if absent."""
         value = self.model.get(name, default)
         if not isinstance(value, str) or value not in options:
             raise self.refused(name, value, f"one of {', '.join(options)}")
         return value
 
     def color(self, name: str, default: str, names: Mapping[str, tuple[float, float, float]]) -> NDArray[np.float32]:
-        """RGB field of ``pipeline.model`` as float32 [3] in [0, 1]; ``default`` if absent.
+        """Return the RGB field of ``pipeline.model`` as float32 [3] in [0, 1]; ``default`` if absent.
 
         Args:
             names: Colours of the names that the model shows, letter by letter; it stops at others.
@@ -118,14 +118,14 @@ class RunConfig:
         raise self.refused(name, value, f"{', '.join(names)} or three numbers from 0 to 1")
 
     def flag(self, name: str, default: bool) -> bool:
-        """Boolean field of ``pipeline.model``; ``default`` if absent."""
+        """Return the boolean field of ``pipeline.model``; ``default`` if absent."""
         value = self.model.get(name, default)
         if not isinstance(value, bool):
             raise self.refused(name, value, "true or false")
         return value
 
     def refused(self, name: str, value: Any, wanted: str) -> InputError:
-        """The error of a field of ``pipeline.model``."""
+        """Return an InputError of a field of ``pipeline.model``."""
         return unusable(value, field=f"pipeline.model.{name}", fix=f"write {wanted}", file=self.file)
 
 
@@ -151,7 +151,7 @@ def read_config(path: str | os.PathLike[str]) -> RunConfig:
 
 
 def _which_run(folder: Path) -> str:
-    """What to give in place of a folder without a config.yml: a run below it, such as those of an experiment."""
+    """Return advice for a folder without a config.yml: the runs below it, such as those of an experiment."""
     below = (inner / CONFIG_NAME for depth in (1, 2, 3) for inner in folder.glob("*/" * depth))
     runs = sorted(islice((file for file in islice(below, _FOLDERS_SEEN) if file.is_file()), _RUNS_SHOWN))
     if not runs:
@@ -160,7 +160,7 @@ def _which_run(folder: Path) -> str:
 
 
 def read_mapping(file: Path, what: str) -> dict[str, Any]:
-    """What a YAML file of a mapping holds; Python objects in it are kept as `Tagged`, never built."""
+    """Return the mapping in a YAML file; Python objects in it are kept as `Tagged`, never built."""
     refuse_other_kind(file)
     root = as_mapping(_parse_yaml(read_text(file, what, CONFIG_BYTES_LIMIT), file))
     if root is None:
@@ -169,7 +169,7 @@ def read_mapping(file: Path, what: str) -> dict[str, Any]:
 
 
 def as_mapping(value: Any) -> dict[str, Any] | None:
-    """The mapping that a YAML value holds, with a Python object's tag removed; None if it holds none.
+    """Return the mapping that a YAML value holds, with a Python object's tag removed; None if it holds none.
 
     An object that is made by a call (``object/apply``, ``object/new``) is its state alone: with other arguments it may
     hold what nothing here reads.
@@ -185,7 +185,7 @@ def as_mapping(value: Any) -> dict[str, Any] | None:
 
 
 def find_checkpoint(run: RunConfig, step: int | None = None) -> Path:
-    """The checkpoint that Nerfstudio shows (nerfstudio/utils/eval_utils.py, ``eval_load_checkpoint``).
+    """Return the checkpoint that Nerfstudio shows (nerfstudio/utils/eval_utils.py, ``eval_load_checkpoint``).
 
     Args:
         run: The run's configuration; ``load_step`` in it names a step. Nerfstudio's evaluation replaces ``load_dir``
@@ -227,7 +227,7 @@ def find_checkpoint(run: RunConfig, step: int | None = None) -> Path:
 
 
 def load_step(run: RunConfig) -> int | None:
-    """The training step that config.yml names for evaluation; None: the highest one."""
+    """Return the training step that config.yml names for evaluation; None: the highest one."""
     value = run.root.get("load_step")
     if value is not None and (isinstance(value, bool) or not isinstance(value, int) or not 0 <= value < 10**18):
         raise unusable(value, field="load_step", fix="write a step, or null", file=run.file)
@@ -235,7 +235,7 @@ def load_step(run: RunConfig) -> int | None:
 
 
 def step_assumption(run: RunConfig, checkpoint: Path, requested: int | None) -> Assumption:
-    """Which training step is shown, and what decided it."""
+    """Return the assumption on the training step that is shown, and its origin."""
     match = _CHECKPOINT_NAME.fullmatch(checkpoint.name)
     step = int(match[1]) if match else checkpoint.name
     stored = load_step(run)
@@ -246,7 +246,7 @@ def step_assumption(run: RunConfig, checkpoint: Path, requested: int | None) -> 
 
 
 def idle_assumptions(state: Collection[str], idle: Mapping[str, str]) -> tuple[Assumption, ...]:
-    """Which of the ``idle`` modules a checkpoint's ``state`` holds, which are left out."""
+    """Return assumptions on the ``idle`` modules in a checkpoint's ``state``, which are left out."""
     return tuple(
         Assumption(f"module {prefix.rstrip('.')}", f"left out: {why}", "checkpoint")
         for prefix, why in idle.items()
@@ -255,7 +255,7 @@ def idle_assumptions(state: Collection[str], idle: Mapping[str, str]) -> tuple[A
 
 
 def units_assumption(transform: DataparserTransform, assumed: bool) -> Assumption:
-    """The units of the data set; ``assumed``: the run does not say them."""
+    """Return the assumption on the units of the data set; ``assumed``: the run does not state them."""
     origin = NO_TRANSFORMS if assumed else TRANSFORMS_NAME
     scale = transform.scale if assumed else transform.stated_scale
     text = "those of the data set differ by direction" if scale is None else f"1 of the data set is {scale:.9g}"
@@ -263,7 +263,7 @@ def units_assumption(transform: DataparserTransform, assumed: bool) -> Assumptio
 
 
 def placing_parser(run: RunConfig) -> str | None:
-    """The data parser, if the run's frame is told from that of a ``transforms.json``: not by every one.
+    """Return the data parser that placed the run's frame against a ``transforms.json``; None: none that is known.
 
     Instant-NGP's leaves alone what the file says was applied to its poses. Orienting by "pca" may turn the transform
     that is stored, and not the poses (nerfstudio/cameras/camera_utils.py:579).
@@ -280,13 +280,13 @@ def placing_parser(run: RunConfig) -> str | None:
 
 
 def config_class(run: RunConfig) -> str:
-    """Dotted name of the class of ``pipeline.model``, whose defaults absent keys have; "" where it has none."""
+    """Return dotted name of the class of ``pipeline.model``, whose defaults absent keys have; "" without a class."""
     model = (as_mapping(run.root.get("pipeline")) or {}).get("model")
     return model.tag.rpartition(":")[2] if isinstance(model, Tagged) else ""
 
 
 def target_class(run: RunConfig) -> str:
-    """Dotted name of the model's class that config.yml names; "" where it names none."""
+    """Return the dotted name of the model's class that config.yml names; "" where it names none."""
     target = run.model.get("_target")
     if target is None:
         return config_class(run).removesuffix("Config")
@@ -330,7 +330,7 @@ def read_dataparser_transform(run: RunConfig) -> tuple[DataparserTransform, tupl
 
 
 def read_model_state(path: Path) -> dict[str, Any]:
-    """The model's tensors (`StoredTensor`) in a checkpoint, read without running code in the file.
+    """Return the model's tensors (`StoredTensor`) in a checkpoint, read without running code in the file.
 
     ``path``: a ``step-*.ckpt`` file. Returns the state of the model: keys as in ``Model.state_dict()``, that is without
     the ``_model.`` prefix of the pipeline and the ``module.`` of distributed training. Raises InputError where the file
@@ -472,7 +472,7 @@ class _InertLoader(yaml.SafeLoader):
         return super().construct_mapping(node, deep=deep)
 
     def construct_inert(self, node: Any) -> Any:
-        """Value of a node with a tag that YAML itself does not define."""
+        """Return the value of a node with a tag that YAML itself does not define."""
         if isinstance(node, yaml.SequenceNode):
             value: Any = self.construct_sequence(node, deep=True)
         elif isinstance(node, yaml.MappingNode):

@@ -55,7 +55,7 @@ class AbstractNerfModelConfig(VanillaModelConfig):
 
     @classmethod
     def of(cls, config: VanillaModelConfig) -> AbstractNerfModelConfig:
-        """The configuration of nerfstudio's vanilla-nerf (vanilla_nerf.py:82-104) with abstract images."""
+        """Return the configuration of Nerfstudio's vanilla-nerf (vanilla_nerf.py:82-104) with abstract images."""
         names = {entry.name for entry in dataclasses.fields(VanillaModelConfig)} - {"_target"}
         settings = {name: value for name, value in vars(config).items() if name in names}
         return cls(
@@ -96,7 +96,7 @@ class AbstractNerfModel(AbstractOutputs, NeRFModel):
         )
 
     def abstract_source(self) -> NerfSource | None:
-        """The fields as they are shown; None where they are not what can be bounded.
+        """Return the shown fields; None where they cannot be bounded.
 
         Raises:
             InputError: Only a part is shown, or by another camera.
@@ -135,14 +135,14 @@ class AbstractNerfModel(AbstractOutputs, NeRFModel):
         )
 
     def _color_behind(self) -> np.ndarray:
-        """[3] colour behind the last sample; black where it is random (renderers.py:144-146)."""
+        """Return the [3] colour behind the last sample; black where it is random (renderers.py:144-146)."""
         color = self.renderer_rgb.background_color
         if isinstance(color, str):
             color = COLORS_DICT.get(color, torch.zeros(3, dtype=torch.float32))
         return color.detach().cpu().numpy().astype(np.float32).reshape(3)
 
     def _concrete(self, camera: Any, obb_box: Any) -> dict[str, torch.Tensor]:
-        """The model's own outputs; in a viewer without CUDA, small pictures first, so that the camera can move."""
+        """Return the model's own outputs; in a viewer without CUDA small ones first, so that the camera can move."""
         lens = _other_lens(camera)
         self._unlike = lens if obb_box is None else _CROPPED
         if not self.abstract.control.present or self.device.type == "cuda" or self.training or lens is not None:
@@ -168,7 +168,7 @@ class AbstractNerfModel(AbstractOutputs, NeRFModel):
         return {name: resampled(value, pinhole.height, pinhole.width) for name, value in best.items()}
 
     def get_loss_dict(self, outputs: Any, batch: Any, metrics_dict: Any = None) -> dict[str, torch.Tensor]:
-        """The losses of vanilla-nerf and the penalty."""
+        """Return the losses of vanilla-nerf and the penalty."""
         losses = super().get_loss_dict(outputs, batch, metrics_dict)
         if self.config.smoothness_penalty > 0.0:
             fields = [f for f in (self.field_coarse, self.field_fine) if f is not None]
@@ -178,7 +178,7 @@ class AbstractNerfModel(AbstractOutputs, NeRFModel):
 
 
 def _other_lens(camera: Cameras) -> tuple[str, str] | None:
-    """Problem and fix where rays are not those of a perspective camera without distortion (cameras.py:622-790)."""
+    """Return problem and fix where rays are not of a perspective camera without distortion (cameras.py:622-790)."""
     if bool((camera.camera_type != CameraType.PERSPECTIVE.value).any()):
         return "only perspective cameras are bounded", "choose Perspective in the viewer's Render tab"
     if camera.distortion_params is not None and bool(camera.distortion_params.any()):
@@ -187,12 +187,12 @@ def _other_lens(camera: Cameras) -> tuple[str, str] | None:
 
 
 def with_depth(outputs: dict[str, torch.Tensor]) -> dict[str, torch.Tensor]:
-    """The outputs and ``depth``, without which the viewer's render thread ends (render_state_machine.py:198)."""
+    """Return the outputs and ``depth``, without which the viewer's thread ends (render_state_machine.py:198)."""
     return {**outputs, "depth": outputs["depth_fine"]}
 
 
 def log_lipschitz(module: torch.nn.Module) -> torch.Tensor:
-    """Sum over the linear layers of the logarithm of their norm from maximum to maximum.
+    """Return the sum over the linear layers of the logarithm of their norm from maximum to maximum.
 
     The exponential bounds how much a network of these layers and of activations that are no steeper
     than 1 stretches a box, up to skip connections (H.-T. D. Liu et al., "Learning smooth neural

@@ -69,7 +69,7 @@ class AbstractConfig:
 
 
 def pictures(snapshot: Snapshot | None, height: int, width: int, depth: bool = False) -> dict[str, torch.Tensor]:
-    """Outputs [height, width, 3] for the bounds, [height, width, 1] for the gaps; repeats pixels of small pictures.
+    """Return outputs [height, width, 3] for the bounds and [height, width, 1] for the gaps, enlarged to that size.
 
     ``abstract_gap`` is the length over RGB of upper - lower, ``abstract_witness`` the same of the least
     and largest values that were really rendered. Without a snapshot the bounds are 0 and 1. With ``depth`` also
@@ -97,7 +97,7 @@ def pictures(snapshot: Snapshot | None, height: int, width: int, depth: bool = F
 
 
 def resampled(image: torch.Tensor, height: int, width: int) -> torch.Tensor:
-    """[height, width, c] of an image [h, w, c]: at every place the pixel of the image that covers its middle."""
+    """Return [height, width, c] of an image [h, w, c]: at every place the pixel that covers its middle."""
 
     def places(wanted: int, there: int) -> torch.Tensor:
         return ((torch.arange(wanted, dtype=torch.float64) + 0.5) * (there / wanted)).clamp(max=there - 1).long()
@@ -158,12 +158,12 @@ class AbstractOutputs(_Base):
         self._evaluating = True
 
     def abstract_source(self) -> Source | None:
-        """The scene as it is shown; the same object as long as nothing changes. None: there are no bounds for it."""
+        """Return the shown scene; the same object as long as nothing changes. None: there are no bounds for it."""
         return None
 
     @torch.no_grad()
     def get_outputs_for_camera(self, camera: Any, obb_box: Any = None) -> dict[str, torch.Tensor]:
-        """The model's outputs and the abstract images."""
+        """Return the model's outputs and the abstract images."""
         outputs = self._concrete(camera, obb_box)
         if not self._evaluating or self.training:
             return outputs
@@ -236,7 +236,7 @@ class AbstractOutputs(_Base):
     def get_image_metrics_and_images(
         self, outputs: dict[str, torch.Tensor], batch: dict[str, torch.Tensor]
     ) -> tuple[dict[str, float], dict[str, torch.Tensor]]:
-        """The model's metrics and, where there are abstract images, theirs; LPIPS only where it has weights."""
+        """Return the model's metrics and, where there are abstract images, theirs; LPIPS only with weights."""
         metrics, images = super().get_image_metrics_and_images(outputs, batch)
         if not lpips_known(self.lpips):  # pyright: ignore[reportArgumentType]
             metrics = {name: value for name, value in metrics.items() if "lpips" not in name}

@@ -296,13 +296,13 @@ def _within(file: Path, folder: Path) -> bool:
 
 
 def _outside(run: Path | None) -> Path:
-    """Folder to write views to: the working directory, or the temporary one if that lies within ``run``."""
+    """Return the folder to write views to: the working directory, or the temporary one if that lies within ``run``."""
     here = Path()
     return Path(tempfile.gettempdir()) if run is not None and _within(here, run) else here
 
 
 def _short(file: Path) -> str:
-    """A path as seen from the working directory, where that is shorter."""
+    """Return a path as seen from the working directory, where that is shorter."""
     return min(str(file), os.path.relpath(file), key=len)
 
 
@@ -314,7 +314,7 @@ def _free_name(folder: Path) -> Path:
 
 
 def certify_path(view: ViewRequest) -> dict[str, Any]:
-    """A camera path of one entry, with the set under "perturbation", as the other commands read it."""
+    """Return a camera path of one entry, with the set under "perturbation", for the other commands."""
     camera, perturbation = view.camera, view.perturbation
     pose = np.concatenate([camera.camera_to_world, [[0.0, 0.0, 0.0, 1.0]]])
     fov = math.degrees(2.0 * math.atan(0.5 * camera.height / camera.fy))
@@ -323,7 +323,7 @@ def certify_path(view: ViewRequest) -> dict[str, Any]:
 
 
 def describe(view: ViewRequest, snapshot: Snapshot | None, status: Status, about: str = "") -> str:
-    """The figures of a view for people (Markdown)."""
+    """Return the figures of a view as Markdown."""
     states = {"off": "", "starting": "starting", "working": "refining …", "idle": "done", "failed": "stopped"}
     state = states[status.state] + (f": {status.detail}" if status.detail else "")
     if snapshot is None:
@@ -346,7 +346,7 @@ def describe(view: ViewRequest, snapshot: Snapshot | None, status: Status, about
 
 
 def camera_of(cameras: Any) -> PinholeCamera:
-    """The first of nerfstudio's ``Cameras`` as a pinhole camera; lens distortion plays no part, as in Splatfacto."""
+    """Return the first of Nerfstudio's ``Cameras`` as a pinhole camera without distortion, as in Splatfacto."""
 
     def first(value: Any) -> float:
         return float(value.reshape(-1)[0])

@@ -56,7 +56,7 @@ class AbstractSplatfactoModel(AbstractOutputs, SplatfactoModel):
         self.config = config
 
     def _splats(self) -> tuple[SplatScene, Splats]:
-        """The model's current Gaussians, as a scene and activated; kept until parameters or the step change."""
+        """Return the model's current Gaussians, as a scene and activated; kept until parameters or the step change."""
         state = tuple((id(value), value._version) for value in self.gauss_params.values())
         if self._active is None or self._active[0] != (state, self.step):
             plain = self.config.sh_degree == 0
@@ -82,7 +82,7 @@ class AbstractSplatfactoModel(AbstractOutputs, SplatfactoModel):
         return installed_gsplat() if version is None else VERSIONS[version]
 
     def _scene(self) -> tuple[SplatSource, Renderer]:
-        """What is shown: the Gaussians inside the crop box, before the background."""
+        """Return the shown scene: the Gaussians inside the crop box, before the background."""
         scene, splats = self._splats()
         # of the whole scene, and where the crop box leaves no Gaussian (splatfacto.py:551-554)
         background, without = (
@@ -109,7 +109,7 @@ class AbstractSplatfactoModel(AbstractOutputs, SplatfactoModel):
         return self._scene()[0]
 
     def get_outputs(self, camera: Cameras) -> dict[str, Any]:
-        """Outputs as Splatfacto's; without CUDA from this package's renderer (splatfacto.py:547-665)."""
+        """Return Splatfacto's outputs; without CUDA by this package's renderer (splatfacto.py:547-665)."""
         if self.device.type == "cuda" or not isinstance(camera, Cameras):
             return super().get_outputs(camera)
         if self.training:
@@ -131,7 +131,7 @@ class AbstractSplatfactoModel(AbstractOutputs, SplatfactoModel):
 
 
 def cropped(scene: SplatScene, inside: np.ndarray) -> SplatScene:
-    """The Gaussians of ``scene`` where ``inside`` [N] is true; they keep their numbers in the source."""
+    """Return the Gaussians of ``scene`` where ``inside`` [N] is true; they keep their numbers in the source."""
     parts = {name: getattr(scene, name)[inside] for name in ("means", "log_scales", "quats", "opacity_logits", "sh")}
     stored = np.arange(scene.count) if scene.stored is None else scene.stored
     left_out = scene.dropped | {"outside the crop box": int((~inside).sum())}

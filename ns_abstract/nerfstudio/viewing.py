@@ -82,7 +82,7 @@ def run_of_ply(file: Path, folder: Path, overrides: Overrides | None = None) -> 
 def open_run(
     config_file: Path, abstract: Mapping[str, Any] | None = None, overrides: Overrides | None = None
 ) -> tuple[TrainerConfig, Pipeline, int]:
-    """nerfstudio's ``eval_setup`` with models that bound; the run may have been moved.
+    """Return Nerfstudio's ``eval_setup`` with models that bound; the run may have been moved.
 
     config.yml is read by nerfstudio's own loader, which can run code, so it is read before by ours, which runs none,
     and so is the checkpoint: what names other objects than runs of nerfstudio do is refused. ``abstract`` are options

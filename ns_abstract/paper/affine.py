@@ -26,12 +26,12 @@ def _as_range(form: FormArray) -> Interval:
 
 
 def form_of(basis: Basis, values: Interval) -> FormArray:
-    """Forms without polynomial part that enclose ``values``."""
+    """Return forms without polynomial part that enclose ``values``."""
     return FormArray.constant(basis, values.middle, values.radius)
 
 
 def _merge(mask: BoolArray, first: FormArray, second: FormArray) -> FormArray:
-    """``first`` where ``mask``, else ``second``."""
+    """Return ``first`` where ``mask``, else ``second``."""
     return FormArray(first.basis, np.where(mask.ravel(), first.data, second.data), first.shape)
 
 
@@ -53,13 +53,13 @@ class Enclosure:
 
     @classmethod
     def of(cls, basis: Basis, values: Interval | ArrayLike) -> Enclosure:
-        """Quantities of which nothing but ``values`` is known."""
+        """Return enclosures of ``values`` without a relation to parameters."""
         values = Interval.lift(values)
         return cls(form_of(basis, values), values)
 
     @classmethod
     def lift(cls, value: Enclosure | FormArray | Interval | ArrayLike, basis: Basis | None = None) -> Enclosure:
-        """``value`` as an enclosure; numbers and intervals need ``basis``. Raises TypeError without one."""
+        """Return ``value`` as an enclosure; numbers and intervals need ``basis``. Raises TypeError without one."""
         if isinstance(value, Enclosure):
             return value
         if isinstance(value, FormArray):
@@ -70,7 +70,7 @@ class Enclosure:
 
     @classmethod
     def parameters(cls, box: Interval, order: int = 1) -> Enclosure:
-        """One parameter per element of ``box``, each running over its interval."""
+        """Return one parameter per element of ``box``, each running over its interval."""
         count = int(np.prod(box.shape))
         basis = Basis(count, order)
         middle, radius = box.middle.ravel(), box.radius.ravel()
@@ -81,7 +81,7 @@ class Enclosure:
 
     @classmethod
     def stack(cls, parts: list[Enclosure]) -> Enclosure:
-        """Enclosures of one shape along a new first axis."""
+        """Return enclosures of one shape along a new first axis."""
         rows = parts[0].form.basis.rows
         shape = (len(parts), *parts[0].shape)
         data = np.stack([part.form.data for part in parts], axis=1).reshape(rows, -1)
@@ -101,19 +101,19 @@ class Enclosure:
         return self.range.bounds()
 
     def meet(self, other: Interval) -> Enclosure:
-        """The same quantity, known to lie in ``other`` as well."""
+        """Return the same quantity intersected with ``other``."""
         return Enclosure(self.form, self.range.intersect(other))
 
     def __getitem__(self, index: Any) -> Enclosure:
         return Enclosure(self.form[index], self.range[index])
 
     def reshape(self, *shape: int) -> Enclosure:
-        """The same quantities in another shape."""
+        """Return the same quantities in another shape."""
         range_ = self.range.reshape(*shape)
         return Enclosure(FormArray(self.basis, self.form.data, range_.shape), range_)
 
     def broadcast_to(self, shape: tuple[int, ...]) -> Enclosure:
-        """The quantities repeated to ``shape``."""
+        """Return the quantities repeated to ``shape``."""
         return Enclosure(self.form.broadcast_to(shape), self.range.broadcast_to(shape))
 
     def transpose(self) -> Enclosure:
@@ -161,7 +161,7 @@ class Enclosure:
         return Enclosure(self.form.sum(axis), self.range.sum(axis))
 
     def prod(self, axis: int = -1) -> Enclosure:
-        """Product along one axis, front to back."""
+        """Return the product along one axis, front to back."""
         axis %= len(self.shape)
         whole = self.range.prod(axis)
         if self.shape[axis] == 0:
@@ -173,7 +173,7 @@ class Enclosure:
         return result.meet(whole)
 
     def square(self) -> Enclosure:
-        """``x * x``."""
+        """Return ``x * x``."""
         return Enclosure(self.form.square(), self.range.square())
 
     def power(self, exponent: int) -> Enclosure:
@@ -188,7 +188,7 @@ class Enclosure:
         return result.meet(whole)
 
     def _curve(self, curve: lines.ConvexFunction, domain: BoolArray, taylor: FormArray | None) -> Enclosure:
-        """A convex or concave function: a band, or the Taylor polynomial where that leaves less."""
+        """Return a convex or concave function of this: a band, or the Taylor polynomial where that has less width."""
         whole = curve.value(self.range)
         domain = domain & np.isfinite(self.range.lower) & np.isfinite(self.range.upper)
         inside = Interval(np.where(domain, self.range.lower, 1.0), np.where(domain, self.range.upper, 1.0))
@@ -206,7 +206,7 @@ class Enclosure:
         return Enclosure(_merge(domain, form, form_of(self.basis, whole)), whole)
 
     def exp(self) -> Enclosure:
-        """``exp(x)``."""
+        """Return ``exp(x)``."""
         finite = np.isfinite(self.range.upper) & (np.abs(self.range.middle) < 600.0)
         return self._curve(lines.EXP, finite, None if self.basis.order == 1 else self._exp_taylor())
 
@@ -224,7 +224,7 @@ class Enclosure:
         return form
 
     def reciprocal(self) -> Enclosure:
-        """``1 / x``; nothing is known where ``x`` may be 0."""
+        """Return ``1 / x``; unbounded where ``x`` may be 0."""
         negative = self.range.upper < 0.0
         sign = np.where(negative, -1.0, 1.0)
         positive = Enclosure(self.form * sign, self.range * sign)
@@ -240,16 +240,16 @@ class Enclosure:
         return self._lift(other) / self
 
     def sqrt(self) -> Enclosure:
-        """``sqrt(x)``; nothing is known where ``x`` may be negative."""
+        """Return ``sqrt(x)``; unbounded where ``x`` may be negative."""
         taylor = self.form.sqrt() if self.basis.order == 2 else None
         return self._curve(lines.SQRT, (self.range.lower >= 0.0) & (self.range.upper > 0.0), taylor)
 
     def norm(self) -> Enclosure:
-        """Frobenius norm over all elements, a scalar."""
+        """Return the Frobenius norm over all elements, a scalar."""
         return self.square().reshape(-1).sum(0).sqrt().meet(self.range.norm())
 
     def indicator(self) -> Enclosure:
-        """1 where ``x > 0``, else 0; both where undecided (no slope narrows the unit step's range)."""
+        """Return 1 where ``x > 0``, else 0; both where undecided (no slope narrows the unit step's range)."""
         return Enclosure.of(self.basis, self.range.indicator())
 
 
@@ -258,7 +258,7 @@ Face = TypeVar("Face", Interval, Enclosure)
 
 
 def range_of(x: Interval | Enclosure) -> Interval:
-    """The intervals that hold ``x``."""
+    """Return the intervals that hold ``x``."""
     return x if isinstance(x, Interval) else x.range
 
 

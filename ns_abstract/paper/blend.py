@@ -15,13 +15,13 @@ from ns_abstract.paper.interval import Float64Array, Interval
 
 
 def blend(alphas: Float64Array, colors: Float64Array) -> Float64Array:
-    """The blended value of layers [n, ...] (float64)."""
+    """Return the blended value of layers [n, ...] (float64)."""
     light = np.cumprod(np.concatenate([np.ones((1, *alphas.shape[1:])), 1.0 - alphas[:-1]]), axis=0)
     return (light * alphas * colors).sum(axis=0)
 
 
 def cumulative_blend(alphas: Face, colors: Interval | Float64Array) -> Face:
-    """Lines 8-10 of Algorithm 2 operation by operation: every opacity is used once per layer behind it.
+    """Return the blend by lines 8-10 of Algorithm 2: every opacity is used once per layer behind it.
 
     Args:
         alphas: Opacities [n, ...], of any face.
@@ -41,7 +41,7 @@ def cumulative_blend(alphas: Face, colors: Interval | Float64Array) -> Face:
 
 
 def _over(alpha: Interval, color: Interval, behind: Interval) -> Interval:
-    """The hull of ``P + a (c - P)``: multi-affine, so its extremes lie at the ends."""
+    """Return the hull of ``P + a (c - P)``: multi-affine, so its extremes lie at the ends."""
     ends = itertools.product(alpha.bounds(), color.bounds(), behind.bounds())
     values = [Interval(p) + Interval(a) * (Interval(c) - p) for a, c, p in ends]
     return Interval(
@@ -50,7 +50,7 @@ def _over(alpha: Interval, color: Interval, behind: Interval) -> Interval:
 
 
 def sumcumprod(alphas: Face, colors: Interval | Float64Array, behind: float = 0.0) -> Face:
-    """SUMCUMPROD (Algorithm 5): blend back to front, ``P <- a_i c_i + (1 - a_i) P``, each ``a_i`` once.
+    """Return SUMCUMPROD (Algorithm 5): blend back to front, ``P <- a_i c_i + (1 - a_i) P``, each ``a_i`` once.
 
     For independent opacities in [0, 1] the interval face is the exact range up to rounding: P increases with the P
     behind it, and each step is exact. The affine face takes each step as ``P + a (c - P)``, so a remainder behind a

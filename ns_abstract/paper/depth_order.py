@@ -17,19 +17,19 @@ Depths = TypeVar("Depths", Interval, Enclosure)
 
 
 def _differences(depths: Depths) -> Interval:
-    """Ranges of ``d_i - d_j`` [n, n]."""
+    """Return ranges of ``d_i - d_j`` [n, n]."""
     n = depths.shape[0]
     rows = depths.reshape(n, 1).broadcast_to((n, n))
     return range_of(rows - depths.reshape(1, n).broadcast_to((n, n)))
 
 
 def surely_in_front(depths: Depths) -> BoolArray:
-    """[n, n] whether layer j lies in front of layer i, ``d_j < d_i``, for every parameter value."""
+    """Return [n, n] whether layer j lies in front of layer i, ``d_j < d_i``, for every parameter value."""
     return _differences(depths).lower > 0.0
 
 
 def sort_by(x: Face, y: Depths) -> Face:
-    """Bounds of ``x`` [n, ...] in ascending order of ``y`` [n]: each place holds every element that may stand there.
+    """Return bounds of ``x`` [n, ...] in ascending order of ``y`` [n]: each place holds every possible element.
 
     Element i may take the places from the number of elements surely before it to n - 1 minus the number surely after
     it; equal keys are undecided. A place with one candidate keeps its form.
@@ -51,12 +51,12 @@ def sort_by(x: Face, y: Depths) -> Face:
 
 
 def sorted_blend(alphas: Face, depths: Depths, colors: Interval | Float64Array) -> Face:
-    """Lines 13-18 of Algorithm 1 with sorted opacities and colours bounded one by one."""
+    """Return the blend by lines 13-18 of Algorithm 1, with sorted opacities and colours bounded one by one."""
     return cumulative_blend(sort_by(alphas, depths), sort_by(Interval.lift(colors), depths))
 
 
 def vr_ind(alphas: Face, depths: Depths, colors: Interval | Float64Array) -> Face:
-    """VR-IND (Algorithm 4): ``pc = sum_i w_i c_i``, without sorting, of opacities [n, ...] in [0, 1] and depths [n].
+    """Return VR-IND (Algorithm 4): ``pc = sum_i w_i c_i``, without sorting, of opacities [n, ...] and depths [n].
 
     ``w_i = a_i prod_{j != i} (1 - a_j Ind(d_i - d_j))`` (eq. 22; its ``a_i`` inside the product is a misprint for
     ``a_j``). The indicator of a pair that may be equally deep counts as undecided, so that either order of a tie is

@@ -24,19 +24,19 @@ BoolArray = NDArray[np.bool_]
 
 
 def round_down(values: ArrayLike) -> Float64Array:
-    """The next smaller binary64 number."""
+    """Return the next smaller binary64 number."""
     with np.errstate(over="ignore", under="ignore"):
         return np.nextafter(values, -np.inf)
 
 
 def round_up(values: ArrayLike) -> Float64Array:
-    """The next larger binary64 number."""
+    """Return the next larger binary64 number."""
     with np.errstate(over="ignore", under="ignore"):
         return np.nextafter(values, np.inf)
 
 
 def _sum_ends(a: Float64Array, b: Float64Array) -> tuple[Float64Array, Float64Array]:
-    """Numbers just below and just above ``a + b`` (equal where the sum is exact; Knuth's TwoSum)."""
+    """Return numbers just below and just above ``a + b`` (equal where the sum is exact; Knuth's TwoSum)."""
     with np.errstate(invalid="ignore", over="ignore"):
         total = a + b
         part = total - a
@@ -47,7 +47,7 @@ def _sum_ends(a: Float64Array, b: Float64Array) -> tuple[Float64Array, Float64Ar
 
 
 def _product_ends(a: Float64Array, b: Float64Array) -> tuple[Float64Array, Float64Array]:
-    """Numbers just below and just above ``a * b``; zero times an unbounded end is zero."""
+    """Return numbers just below and just above ``a * b``; zero times an unbounded end is zero."""
     with np.errstate(invalid="ignore", over="ignore", under="ignore"):
         product = a * b
     zero = (a == 0.0) | (b == 0.0)
@@ -70,7 +70,7 @@ def _exp_values(x, out):
 
 
 def _exp_ends(x: Float64Array) -> tuple[Float64Array, Float64Array]:
-    """Numbers below and above ``exp(x)``; beyond the kernel's domain as the square of ``exp(x / 2)``."""
+    """Return numbers below and above ``exp(x)``; beyond the kernel's domain as the square of ``exp(x / 2)``."""
     far = np.abs(x) > EXP_HIGHEST
     argument = np.clip(np.where(far, 0.5 * x, x), -EXP_HIGHEST, EXP_HIGHEST)
     value = np.empty(argument.size)
@@ -87,7 +87,7 @@ def _exp_ends(x: Float64Array) -> tuple[Float64Array, Float64Array]:
 
 
 def _power_ends(x: Float64Array, exponent: int) -> tuple[Float64Array, Float64Array]:
-    """Numbers just below and just above ``x ** exponent``."""
+    """Return numbers just below and just above ``x ** exponent``."""
     size = np.abs(x)
     down = up = np.ones(x.shape)
     for _ in range(exponent):
@@ -130,17 +130,17 @@ class Interval:
 
     @classmethod
     def lift(cls, value: Interval | ArrayLike) -> Interval:
-        """``value`` itself if it is an interval, else the degenerate interval."""
+        """Return ``value`` itself if it is an interval, else the degenerate interval."""
         return value if isinstance(value, Interval) else cls(value)
 
     @classmethod
     def entire(cls, shape: tuple[int, ...] = ()) -> Interval:
-        """``[-inf, inf]``."""
+        """Return ``[-inf, inf]``."""
         return cls(np.full(shape, -np.inf), np.full(shape, np.inf))
 
     @classmethod
     def stack(cls, parts: list[Interval]) -> Interval:
-        """Intervals of one shape along a new first axis."""
+        """Return intervals of one shape along a new first axis."""
         return cls(np.stack([part.lower for part in parts]), np.stack([part.upper for part in parts]))
 
     def __repr__(self) -> str:
@@ -193,18 +193,18 @@ class Interval:
         return Interval(change(self.lower), change(self.upper))
 
     def reshape(self, *shape: int) -> Interval:
-        """The same intervals in another shape."""
+        """Return the same intervals in another shape."""
         return self._map(lambda end: end.reshape(*shape))
 
     def broadcast_to(self, shape: tuple[int, ...]) -> Interval:
         return self._map(lambda end: np.broadcast_to(end, shape))
 
     def transpose(self) -> Interval:
-        """The last two axes swapped."""
+        """Return the interval with the last two axes swapped."""
         return self._map(lambda end: np.swapaxes(end, -1, -2))
 
     def intersect(self, other: Interval | ArrayLike) -> Interval:
-        """The common part. Raises ValueError where there is none somewhere."""
+        """Return the common part. Raises ValueError where there is none somewhere."""
         other = Interval.lift(other)
         return Interval(np.maximum(self.lower, other.lower), np.minimum(self.upper, other.upper))
 
@@ -234,7 +234,7 @@ class Interval:
     __rmul__ = __mul__
 
     def reciprocal(self) -> Interval:
-        """``1 / x``; unbounded where ``x`` reaches 0, ``[-inf, inf]`` where 0 is inside or all there is."""
+        """Return ``1 / x``; unbounded where ``x`` reaches 0, ``[-inf, inf]`` where 0 is inside or all of it."""
         low, high = _quotient_ends(np.ones(()), self.upper)[0], _quotient_ends(np.ones(()), self.lower)[1]
         inside = ((self.lower < 0.0) & (self.upper > 0.0)) | ((self.lower == 0.0) & (self.upper == 0.0))
         low = np.where(inside | (self.upper == 0.0), -np.inf, low)
@@ -258,7 +258,7 @@ class Interval:
 
     @_defers
     def __matmul__(self, other: Interval | ArrayLike) -> Interval:
-        """Matrix product of the last two axes."""
+        """Return the matrix product of the last two axes."""
         other = Interval.lift(other)
         return (self[..., :, :, None] * other[..., None, :, :]).sum(-2)
 
@@ -292,14 +292,14 @@ class Interval:
         return Interval(np.where(reaches, 0.0, least), self.magnitude)
 
     def square(self) -> Interval:
-        """``x * x``."""
+        """Return ``x * x``."""
         size = self.absolute()
         return Interval(
             np.maximum(_product_ends(size.lower, size.lower)[0], 0.0), _product_ends(size.upper, size.upper)[1]
         )
 
     def power(self, exponent: int) -> Interval:
-        """``x ** exponent`` for an integer ``exponent >= 0``; ``x ** 0`` is 1.
+        """Return ``x ** exponent`` for an integer ``exponent >= 0``; ``x ** 0`` is 1.
 
         Raises:
             ValueError: The exponent is negative.
@@ -325,5 +325,5 @@ class Interval:
         return self.square().reshape(-1).sum(0).sqrt()
 
     def indicator(self) -> Interval:
-        """1 where ``x > 0``, else 0; ``[0, 1]`` where both happen."""
+        """Return 1 where ``x > 0``, else 0; ``[0, 1]`` where both happen."""
         return Interval((self.lower > 0.0).astype(np.float64), (self.upper > 0.0).astype(np.float64))

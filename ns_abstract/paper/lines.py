@@ -40,7 +40,7 @@ SQRT = ConvexFunction(Interval.sqrt, lambda x: (x.sqrt() * 2.0).reciprocal(), la
 
 
 def chord_slope(curve: ConvexFunction, x: Interval) -> Float64Array:
-    """Slope of the chord over ``x``, rounded; that of a tangent where ``x`` is degenerate."""
+    """Return the slope of the chord over ``x``, rounded; that of a tangent where ``x`` is degenerate."""
     ends = [curve.value(Interval(end)).middle for end in x.bounds()]
     with np.errstate(all="ignore"):
         chord = (ends[1] - ends[0]) / (x.upper - x.lower)
@@ -49,7 +49,7 @@ def chord_slope(curve: ConvexFunction, x: Interval) -> Float64Array:
 
 
 def chord_side(curve: ConvexFunction, x: Interval, slope: Float64Array) -> Float64Array:
-    """The offset on the chord's side: ``high`` of a convex function, ``low`` of a concave one."""
+    """Return the offset on the chord's side: ``high`` of a convex function, ``low`` of a concave one."""
     offsets = [curve.value(Interval(end)) - Interval(end) * slope for end in x.bounds()]
     if curve.convex:
         return np.maximum(offsets[0].upper, offsets[1].upper)
@@ -59,7 +59,7 @@ def chord_side(curve: ConvexFunction, x: Interval, slope: Float64Array) -> Float
 def tangent_side(
     curve: ConvexFunction, x: Interval, slope: Float64Array, at: Float64Array | None = None
 ) -> Float64Array:
-    """The offset on the other side, from the tangent at ``at`` (by default where it is parallel to ``slope``)."""
+    """Return offset on the other side, from the tangent at ``at`` (by default where it is parallel to ``slope``)."""
     if at is None:
         with np.errstate(all="ignore"):
             at = curve.touch(slope)
@@ -73,7 +73,7 @@ def tangent_side(
 
 
 def band(curve: ConvexFunction, x: Interval) -> tuple[Float64Array, Interval]:
-    """The narrowest band around ``curve`` over the bounded ``x``: slope, and the interval of ``f(t) - slope * t``."""
+    """Return the narrowest band around ``curve`` over the bounded ``x``: its slope, and the interval of its offset."""
     slope = chord_slope(curve, x)
     chord, tangent = chord_side(curve, x, slope), tangent_side(curve, x, slope)
     return slope, Interval(tangent, chord) if curve.convex else Interval(chord, tangent)

@@ -13,7 +13,7 @@ Norm = Literal["frobenius", "spectral"]
 
 
 def matrix_norm(x: Interval, norm: Norm) -> Float64Array | np.float64:
-    """Upper bound of a submultiplicative norm of a matrix [n, m] that is at least the largest entry.
+    """Return an upper bound of a submultiplicative norm of a matrix [n, m] that is at least the largest entry.
 
     "spectral" is bounded by ``sqrt(|x|_1 |x|_inf)``.
     """
@@ -29,7 +29,7 @@ def _unbounded(x: Face) -> Face:
 
 
 def matrix_inverse(x: Face, reference: Float64Array | None = None, order: int = 2, norm: Norm = "frobenius") -> Face:
-    """MATRIXINV (Algorithm 3): ``X^-1`` by a Taylor polynomial around a reference matrix.
+    """Return MATRIXINV (Algorithm 3): ``X^-1`` by a Taylor polynomial around a reference matrix.
 
     With ``R`` a floating-point inverse of the reference and ``D = I - X R``,
 
@@ -78,7 +78,7 @@ def matrix_inverse(x: Face, reference: Float64Array | None = None, order: int = 
 
 
 def adjugate_inverse(x: Face) -> Face:
-    """The inverse of 2 x 2 matrices as adjugate over determinant, the paper's point of comparison.
+    """Return the inverse of 2 x 2 matrices as adjugate over determinant, the paper's point of comparison.
 
     Args:
         x: Matrices [2, 2], of any face.

@@ -36,7 +36,7 @@ def _require_plain(splats: Splats) -> None:
 
 
 def pixel_centers(camera: PinholeCamera) -> Float64Array:
-    """[H * W, 2] pixel centres (x, y), row-major."""
+    """Return [H * W, 2] pixel centres (x, y), row-major."""
     x, y = (np.arange(size, dtype=np.float64) + 0.5 for size in (camera.width, camera.height))
     x, y = np.meshgrid(x, y)
     return np.stack([x.ravel(), y.ravel()], axis=1)
@@ -49,7 +49,7 @@ def render(
     position: Float64Array,
     pixels: Float64Array | None = None,
 ) -> Float64Array:
-    """GAUSSIANSPLAT (Algorithm 1) in float64, line by line.
+    """Return the picture by GAUSSIANSPLAT (Algorithm 1) in float64, line by line.
 
     Args:
         splats: The scene, activated with the rasteriser `PAPER`.
@@ -97,7 +97,7 @@ def _alpha(
     inverse: Inverse,
     order: int,
 ) -> Enclosure:
-    """Opacity at the points u [P, 2] of one Gaussian (lines 3-10), given its centre [3] in the camera frame."""
+    """Return opacity at the points u [P, 2] of one Gaussian (lines 3-10), given its centre [3] in the camera frame."""
     unit = Interval(np.zeros(u.shape[0]), np.full(u.shape[0], opacity))
     if not (mean.range.lower[2] >= PAPER.near and mean.range.upper[2] <= PAPER.far):
         # some poses drop it
@@ -134,7 +134,7 @@ def bound(
     order: int = 2,
     linear: bool = True,
 ) -> Enclosure:
-    """Bounds of Algorithm 1 over all poses of ``forms``, by the paper's rules.
+    """Return bounds of Algorithm 1 over all poses of ``forms``, by the paper's rules.
 
     Args:
         splats: The scene, activated with the rasteriser `PAPER`; a handful of Gaussians.

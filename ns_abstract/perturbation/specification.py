@@ -104,7 +104,7 @@ def _refuse_overrides(entries: object) -> None:
 
 
 def unit_length(units: str, dataset_scale: float | None, fail: Fail) -> float:
-    """Normalised units per unit of ``units``, "normalised" or "dataset".
+    """Return the normalised units per unit of ``units``, "normalised" or "dataset".
 
     Raises:
         InputError: Units of the data set are meant, and ``dataset_scale`` is None: the scene does not say them.

@@ -112,7 +112,7 @@ def _ordered(low: Vector, high: Vector, name: str, fail: Fail) -> None:
 
 
 def _indices(value: object, name: str, fail: Fail, folder: Path | None) -> tuple[int, ...]:
-    """Numbers of Gaussians, ascending, each once."""
+    """Return numbers of Gaussians, ascending, each once."""
     if isinstance(value, str):
         try:
             array = _index_file(file_beside(folder or Path(), value))
@@ -138,7 +138,7 @@ def _whole_numbers(values: list[Any]) -> np.ndarray | None:
 
 
 def _index_file(file: Path) -> np.ndarray | None:
-    """What an index file holds; None where that is not whole numbers."""
+    """Return the whole numbers in an index file; None where it holds anything else."""
     kind = file.suffix.lower()
     if kind == ".json":
         content = load_json(file, "index file", _INDEX_BYTES)

@@ -56,7 +56,7 @@ class Forms(Floats):
 
     @staticmethod
     def signed_square(value: FormArray) -> FormArray:
-        """``v |v|`` has the derivative ``2 |v|``, and half its second one is the sign of v (A3)."""
+        """Return ``v |v|``, whose derivative is ``2 |v|``, and half its second one is the sign of v (A3)."""
         low, high = value.bounds()
         middle = value.center
         least = np.where(low > 0.0, 1.0, -1.0)
@@ -159,7 +159,7 @@ def affine(a: Float64, b: Float64, c: Float64) -> Dynamics:
 
 
 def unicycle(dt: float, speed: float | None) -> Dynamics:
-    """A unicycle, ``(x, y, heading)``, by Euler's rule: it moves along its heading and turns.
+    """Return a unicycle's dynamics, ``(x, y, heading)``, by Euler's rule: it moves along its heading and turns.
 
     ``x' = x + dt v cos(heading)``, ``y' = y + dt v sin(heading)``, ``heading' = heading + dt w``; the controls are
     (v, w), or w alone where ``speed`` gives v.
@@ -178,7 +178,7 @@ def unicycle(dt: float, speed: float | None) -> Dynamics:
 
 
 def double_integrator(dt: float, axes: int, linear: float, quadratic: float) -> Dynamics:
-    """Positions and velocities of 1 to 4 axes, ``(p_1, .., v_1, ..)``, driven by accelerations, with drag.
+    """Return the dynamics of 1 to 4 axes, ``(p_1, .., v_1, ..)``, driven by accelerations, with drag.
 
     ``p' = p + dt v``, ``v' = v + dt (u - linear v - quadratic v |v|)`` by Euler's rule, axis by axis.
     """
@@ -199,7 +199,7 @@ def double_integrator(dt: float, axes: int, linear: float, quadratic: float) -> 
 
 
 def fixed_wing(dt: float, speed: float) -> Dynamics:
-    """An aeroplane at constant speed, ``(x, y, z, heading, climb)``, by Euler's rule; angles in radians.
+    """Return an aeroplane's dynamics at constant speed, ``(x, y, z, heading, climb)``, by Euler's rule; radians.
 
     ``x' = x + dt v cos(climb) cos(heading)``, ``y' = y + dt v cos(climb) sin(heading)``, ``z' = z + dt v sin(climb)``;
     the controls are the rates of heading and climb.
@@ -218,7 +218,7 @@ def fixed_wing(dt: float, speed: float) -> Dynamics:
 
 
 def quadrotor(dt: float, lag: float, gravity: float) -> Dynamics:
-    """A quadrotor in the plane across its view, ``(across, up, v_across, v_up, roll)``, by Euler's rule.
+    """Return the dynamics of a quadrotor in the plane across its view, ``(across, up, v_across, v_up, roll)``.
 
     An inner loop lets the roll follow its command: ``roll' = roll + dt / lag (command - roll)``. With the thrust
     T = ``gravity`` + its command (accelerations), ``v_across' = v_across + dt T sin(roll)`` and ``v_up' = v_up + dt

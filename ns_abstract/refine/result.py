@@ -84,11 +84,11 @@ class ExtraOutput(ArrayRecord):
     image: Float32Array
 
     def mean_gap(self) -> float:
-        """Mean of ``upper - lower`` over the pixels."""
+        """Return the mean of ``upper - lower`` over the pixels."""
         return float((self.upper.astype(np.float64) - self.lower).mean())
 
     def mean_gap_witness(self) -> float:
-        """Mean of ``witness_upper - witness_lower`` over the pixels."""
+        """Return the mean of ``witness_upper - witness_lower`` over the pixels."""
         return float((self.witness_upper.astype(np.float64) - self.witness_lower).mean())
 
 
@@ -106,7 +106,7 @@ class RenderedMaximum(NamedTuple):
 
 
 def greater(*maxima: RenderedMaximum | None) -> RenderedMaximum | None:
-    """The first of the greatest ``maxima``; None where there is none."""
+    """Return the first of the greatest ``maxima``; None without any."""
     return max((m for m in maxima if m is not None), key=lambda m: m.value, default=None)
 
 

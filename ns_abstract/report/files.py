@@ -168,7 +168,7 @@ def _check_leaves(leaves: Leaves, d: int, fail: Callable[[str], ValueError]) -> 
 
 
 def _parameters(box: ParameterBox) -> np.ndarray:
-    """[d] records (name, unit, lower, upper)."""
+    """Return the parameters as [d] records (name, unit, lower, upper)."""
     text = max([1, *map(len, box.names), *map(len, box.units)])
     kind = [("name", f"U{text}"), ("unit", f"U{text}"), ("lower", "f8"), ("upper", "f8")]
     return np.array(list(zip(box.names, box.units, box.lower, box.upper, strict=True)), kind)

@@ -80,7 +80,7 @@ def touching(lower: Float64, upper: Float64) -> NDArray[np.int64]:
 def falsified_regions(
     entries: Sequence[Mapping[str, Any]], rows: Mapping[int, Sequence[Mapping[str, Any]]]
 ) -> list[FailureRegion]:
-    """The regions of all frames, the largest parts of their sets first, single poses last.
+    """Return the regions of all frames, the largest parts of their sets first, single poses last.
 
     ``entries`` are frames of report.json: index and parameters (name, lower, upper); ``rows`` are by frame its cells:
     lower, upper, verdict, margin, counterexample.

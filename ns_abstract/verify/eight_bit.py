@@ -16,7 +16,7 @@ _STEPS = 255.0
 
 
 def rounded(image: np.ndarray) -> np.ndarray:
-    """``round(255 x) / 255`` of pictures in [0, 1], float32 of the same shape; values outside are clipped first."""
+    """Return ``round(255 x) / 255`` of pictures in [0, 1], float32 of the same shape; x is clipped first."""
     levels = np.rint(np.clip(np.asarray(image, np.float32), 0.0, 1.0) * np.float32(_STEPS))
     return (levels / np.float32(_STEPS)).astype(np.float32)
 

@@ -76,7 +76,7 @@ class Property(ABC):
 
     @abstractmethod
     def sentence(self) -> str:
-        """The property in words, as the end of "on every image ..."."""
+        """Return the property in words, as the end of "on every image ..."."""
 
     @abstractmethod
     def bind(self, pose_set: PoseBox, nominal: Callable[[], np.ndarray]) -> Claim:

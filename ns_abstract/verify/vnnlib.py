@@ -386,7 +386,7 @@ def _sum(first: _Linear, second: _Linear, factor: float) -> _Linear:
 
 
 def _added(total: float, factor: float, value: float) -> float:
-    """``total + factor * value``; InputError if it overflows, or the product vanishes."""
+    """Return ``total + factor * value``; InputError if it overflows, or the product vanishes."""
     product = factor * value
     sum_ = total + product
     if not math.isfinite(sum_) or (factor and value and abs(product) < _SMALLEST):

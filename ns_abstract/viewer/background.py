@@ -147,7 +147,7 @@ class Background:
             self._start_missing_workers()
 
     def best(self, view: ViewRequest, seconds: float) -> Snapshot | None:
-        """The best that is known of ``view``; what is missing is asked for.
+        """Return the best known snapshot of ``view``; better bounds are requested.
 
         Args:
             seconds: Time that the work on the view's own size may take.

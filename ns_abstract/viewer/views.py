@@ -41,7 +41,7 @@ _NERF_MOST = ((200_000, 32), (2_000_000, 16), (None, 8))
 
 
 def perturbation_of(radii: Mapping[str, float], select: str = "{}") -> Perturbation:
-    """The set of poses within ``radii`` of a camera, and of scenes within ``radii`` of the stored one.
+    """Return the set of poses within ``radii`` of a camera, and of scenes within ``radii`` of the stored one.
 
     Args:
         radii: x, y, z (normalised units), yaw, pitch, roll (radians); mean (normalised units), opacity, color.
@@ -83,7 +83,7 @@ class ViewRequest:
         return camera.camera_to_world.tobytes(), tuple(round(value, 6) for value in lens), around
 
     def at_most(self, side: int | None) -> ViewRequest:
-        """This view with a picture of no more than ``side`` pixels along its longest side."""
+        """Return this view with a picture of no more than ``side`` pixels along its longest side."""
         if side is None or self.side <= side:
             return self
         return replace(self, camera=self.camera.rescaled(self.side / side))
@@ -102,7 +102,7 @@ class ViewRequest:
     def stages(
         self, seconds: float, known: int = 0, ladder: Mapping[int, float] = SPLAT_LADDER
     ) -> list[tuple[PinholeCamera, float]]:
-        """Cameras of growing size above the longest side ``known`` and their times; the last is this view's own."""
+        """Return cameras of growing size above the longest side ``known``, with their times; this view's is last."""
         smaller = [(self.camera.rescaled(self.side / s), t) for s, t in ladder.items() if known < s < self.side]
         return [*smaller, (self.camera, seconds)]
 
@@ -129,7 +129,7 @@ class Snapshot:
 
     @classmethod
     def of(cls, result: FrameResult, *, final: bool, guarantee: str) -> Snapshot:
-        """The snapshot of a refinement's result.
+        """Return the snapshot of a refinement's result.
 
         Raises:
             ValueError: The result is one that no sound refinement can have.
@@ -194,11 +194,11 @@ class Source(ABC):
 
     @abstractmethod
     def frame(self, camera: PinholeCamera, perturbation: Perturbation) -> Frame:
-        """The frame of ``camera`` and a set of poses around it. Raises InputError: the scene does not vary so."""
+        """Return frame of ``camera`` and a set of poses around it. Raises InputError: the scene does not vary so."""
 
     @abstractmethod
     def _camera(self) -> PinholeCamera:
-        """A small camera whose frames need the kernels of all views."""
+        """Return a small camera whose frames need the kernels of all views."""
 
     def warm_up(self) -> None:
         """Compile the kernels for one and for several parameters."""
@@ -246,7 +246,7 @@ class SplatSource(Source):
         )
 
     def _varied(self, perturbation: Perturbation) -> VariedSplats:
-        """The scenes of a set; those of the last set are kept, as pictures of several sizes ask for them."""
+        """Return the scenes of a set; those of the last set are cached, for pictures of several sizes."""
         if perturbation.scene not in self._kept:
             varied = vary(self.scene, self.splats, perturbation.scene)
             self._kept.clear()

@@ -11,7 +11,7 @@ from numba.np import arrayobj
 
 @intrinsic
 def borrowed(typingctx, array):  # pyright: ignore[reportRedeclaration]
-    """The same array without a reference to its owner.
+    """Return the same array without a reference to its owner.
 
     Views and calls cost two atomic operations per counted array, which is more than the arithmetic
     of a short loop. The caller keeps the owner alive for as long as the result is used.
@@ -63,7 +63,7 @@ def prefetch(typingctx, array, row, byte):  # pyright: ignore[reportRedeclaratio
 
 @intrinsic
 def pointer(typingctx, array):  # pyright: ignore[reportRedeclaration]
-    """The elements of a contiguous array, in memory order, to be indexed from 0; the caller keeps the owner alive.
+    """Return elements of a contiguous array, in memory order, to be indexed from 0; the caller keeps the owner alive.
 
     Unlike an array it is not counted, has no size and knows no negative index, which short loops notice.
     """
@@ -78,7 +78,7 @@ def pointer(typingctx, array):  # pyright: ignore[reportRedeclaration]
 
 @intrinsic
 def offset_by(typingctx, elements, count):  # pyright: ignore[reportRedeclaration]
-    """The `pointer` to the element ``count`` further on."""
+    """Return a `pointer` to the element ``count`` further on."""
 
     def codegen(context, builder, signature, args):
         kind = context.get_data_type(signature.return_type.dtype)
@@ -101,7 +101,7 @@ def taken(typingctx, counter):  # pyright: ignore[reportRedeclaration]
 
 @intrinsic
 def lowest_bit(typingctx, mask):  # pyright: ignore[reportRedeclaration]
-    """Number of the lowest bit that is set in an int64 that is not 0."""
+    """Return the number of the lowest bit that is set in an int64 that is not 0."""
 
     def codegen(context, builder, signature, args):
         return builder.cttz(args[0], ir.IntType(1)(1))

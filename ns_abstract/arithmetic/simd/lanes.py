@@ -62,7 +62,7 @@ _KINDS = {
 
 
 def _width(*kinds: types.Type) -> int:
-    """Number of lanes of an operation on arguments of the types ``kinds``; 0: all are scalars."""
+    """Return the number of lanes of an operation on arguments of the types ``kinds``; 0: all are scalars."""
     widths = {kind.width for kind in kinds if isinstance(kind, LanesType | MaskType)}
     if len(widths) > 1:
         raise TypeError(f"lanes of different widths: {kinds}")
@@ -145,14 +145,14 @@ def _either(context, builder, sig, args):
 
 
 def common_type(*kinds: types.Type) -> types.Type:
-    """Lanes where one of ``kinds`` is, else float64."""
+    """Return lanes where one of ``kinds`` is, else float64."""
     width = _width(*kinds)
     return _KINDS[width][0] if width else types.float64
 
 
 @intrinsic
 def muladd(typingctx, x, y, z):  # pyright: ignore[reportRedeclaration]
-    """``x * y + z``, rounded once or twice, whichever the processor does faster."""
+    """Return ``x * y + z``, rounded once or twice, whichever the processor does faster."""
 
     def codegen(context, builder, sig, args):
         return by_intrinsic("fmuladd", builder, *operands(builder, sig, args))
@@ -161,7 +161,7 @@ def muladd(typingctx, x, y, z):  # pyright: ignore[reportRedeclaration]
 
 
 def _choice(sign: str):
-    """``b if b sign a else a``, as the built-in ``max`` and ``min`` decide (also on values that are not numbers)."""
+    """Return ``b if b sign a else a``, as the built-in ``max`` and ``min`` decide, also for NaN."""
 
     def codegen(context, builder, sig, args):
         a, b = operands(builder, sig, args)
@@ -172,25 +172,25 @@ def _choice(sign: str):
 
 @intrinsic
 def maximum(typingctx, a, b):  # pyright: ignore[reportRedeclaration]
-    """``max(a, b)``."""
+    """Return ``max(a, b)``."""
     return common_type(a, b)(a, b), _choice(">")
 
 
 @intrinsic
 def minimum(typingctx, a, b):  # pyright: ignore[reportRedeclaration]
-    """``min(a, b)``."""
+    """Return ``min(a, b)``."""
     return common_type(a, b)(a, b), _choice("<")
 
 
 @intrinsic
 def root(typingctx, a):  # pyright: ignore[reportRedeclaration]
-    """Square root, rounded to nearest."""
+    """Return the square root, rounded to nearest."""
     return a(a), lambda context, builder, sig, args: by_intrinsic("sqrt", builder, args[0])
 
 
 @intrinsic
 def where(typingctx, mask, a, b):  # pyright: ignore[reportRedeclaration]
-    """``a`` where ``mask`` holds, else ``b``."""
+    """Return ``a`` where ``mask`` holds, else ``b``."""
 
     def codegen(context, builder, sig, args):
         condition, a, b = args
@@ -214,7 +214,7 @@ def bits(typingctx, mask):  # pyright: ignore[reportRedeclaration]
 
 @intrinsic
 def lane_sum(typingctx, a):  # pyright: ignore[reportRedeclaration]
-    """Sum of the lanes, added half to half: rounded as often as the lanes can be halved."""
+    """Return the sum of the lanes, added half to half: rounded as often as the lanes can be halved."""
 
     def codegen(context, builder, sig, args):
         value, width = args[0], sig.args[0].width
@@ -270,13 +270,13 @@ def _loader(elements, width: int):
 
 @intrinsic
 def load8(typingctx, elements, at):  # pyright: ignore[reportRedeclaration]
-    """``elements[at : at + 8]`` of an `intrinsics.pointer` as lanes."""
+    """Return ``elements[at : at + 8]`` of an `intrinsics.pointer` as lanes."""
     return _loader(elements, 8)
 
 
 @intrinsic
 def load4(typingctx, elements, at):  # pyright: ignore[reportRedeclaration]
-    """``elements[at : at + 4]`` of an `intrinsics.pointer` as lanes."""
+    """Return ``elements[at : at + 4]`` of an `intrinsics.pointer` as lanes."""
     return _loader(elements, 4)
 
 
@@ -302,7 +302,7 @@ def store(typingctx, elements, at, lanes):  # pyright: ignore[reportRedeclaratio
 
 
 def _transposed(builder, rows):
-    """The columns of 8 rows of 8 lanes."""
+    """Return the columns of 8 rows of 8 lanes."""
 
     def mixed(a, b, picks):
         return builder.shuffle_vector(a, b, ir.Constant(ir.VectorType(_INT32, 8), [_INT32(p) for p in picks]))

@@ -32,7 +32,7 @@ from ns_abstract.arithmetic.simd.lanes import bits, load8, maximum, minimum, roo
 
 @njit(cache=True, error_model="numpy", inline="always")
 def size(m):
-    """Doubles of one form of ``m`` monomials."""
+    """Return the number of doubles of one form of ``m`` monomials."""
     return 8 * (m + 3)
 
 
@@ -47,14 +47,14 @@ def _norms(w, a, m, order):
 
 @njit(cache=True, error_model="numpy", forceinline=True)
 def magnitude(w, a, m, order=1):
-    """Upper bound of the polynomial's absolute value, up to rounding."""
+    """Return an upper bound of the polynomial's absolute value, up to rounding."""
     linear, curved = _norms(w, a, m, order)
     return abs(load8(w, a)) + linear + curved
 
 
 @njit(cache=True, error_model="numpy", forceinline=True)
 def set_norms(w, out, m, order=1, d=0):
-    """`forms.set_norms`; the number of parameters ``d`` matters for order 2 alone."""
+    """Return `forms.set_norms`; the number of parameters ``d`` matters for order 2 alone."""
     last = d + 1 if order == 2 else m
     total = 0.0 * load8(w, out)
     for k in range(1, last):
@@ -69,7 +69,7 @@ def set_norms(w, out, m, order=1, d=0):
 
 @njit(cache=True, error_model="numpy")
 def scale_add(w, a, s, b, t, shift, out, m):
-    """`forms.scale_add`; ``out`` may be ``a`` or ``b``."""
+    """Return `forms.scale_add`; ``out`` may be ``a`` or ``b``."""
     total = abs(s) * magnitude(w, a, m) + abs(t) * magnitude(w, b, m) + abs(shift)
     radius = abs(s) * load8(w, a + 8 * m) + abs(t) * load8(w, b + 8 * m) + FORM_ROUNDING * total
     store(w, out, s * load8(w, a) + t * load8(w, b) + shift)
@@ -128,7 +128,7 @@ def add_product(w, a, b, sign, out, m):
 
 @njit(cache=True, error_model="numpy")
 def multiply(w, a, b, out, m):
-    """`forms.multiply` (design.md, A2)."""
+    """Return `forms.multiply` (design.md, A2)."""
     _accumulate(w, a, b, 1.0, out, FORM_ROUNDING, True, m)
     set_norms(w, out, m)
 
@@ -154,7 +154,7 @@ def add_square(w, a, out, m):
 
 @njit(cache=True, error_model="numpy")
 def square(w, a, out, m):
-    """`forms.square`."""
+    """Return `forms.square`."""
     _accumulate_square(w, a, out, FORM_ROUNDING, True, m)
     set_norms(w, out, m)
 
@@ -187,7 +187,7 @@ def bounds(w, a, m, order=1, d=0):
 
 @njit(cache=True, error_model="numpy", forceinline=True)
 def _compose(w, a, f0, f1, f2_low, f2_high, out, m):
-    """`forms.compose` (design.md, A3)."""
+    """Return `forms.compose` (design.md, A3)."""
     r, l = load8(w, a + 8 * m), load8(w, a + 8 * (m + 1))
     e = (l + r) * UP
     low = minimum(f2_low, 0.0) * (e * e)
@@ -213,7 +213,7 @@ def _ends(w, a, m):
 
 @njit(cache=True, error_model="numpy")
 def reciprocal(w, a, out, m):
-    """`forms.reciprocal`."""
+    """Return `forms.reciprocal`."""
     low, high, inside = _ends(w, a, m)
     f0 = 1.0 / where(inside, load8(w, a), 1.0)
     least = where(inside, 1.0 / (high * high * high) * (1.0 - FORM_ROUNDING), 0.0)
@@ -223,7 +223,7 @@ def reciprocal(w, a, out, m):
 
 @njit(cache=True, error_model="numpy")
 def reciprocal_square_root(w, a, out, m):
-    """`forms.reciprocal_square_root`."""
+    """Return `forms.reciprocal_square_root`."""
     low, high, inside = _ends(w, a, m)
     low, high = where(inside, low, 1.0), where(inside, high, 1.0)
     f0 = 1.0 / root(where(inside, load8(w, a), 1.0))
@@ -234,7 +234,7 @@ def reciprocal_square_root(w, a, out, m):
 
 @njit(cache=True, error_model="numpy")
 def logarithm(w, a, out, m):
-    """`forms.logarithm`; ``out`` has room for one more form, which is scratch."""
+    """Return `forms.logarithm`; ``out`` has room for one more form, which is scratch."""
     low, high, inside = _ends(w, a, m)
     center = where(inside, load8(w, a), 1.0)
     scratch = out + size(m)

@@ -62,7 +62,7 @@ class Division:
         return tuple(finer * n for n in self.counts(self.levels))
 
     def inner(self, level: int) -> tuple[int, ...]:
-        """Parts by axis of one cell of a level."""
+        """Return the numbers of parts by axis of one cell of a level."""
         return tuple(p // c for p, c in zip(self.parts, self.counts(level), strict=True))
 
     def boxes(self, level: int) -> tuple[np.ndarray, np.ndarray]:

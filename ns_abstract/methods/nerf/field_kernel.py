@@ -40,7 +40,7 @@ class StackedLayers(NamedTuple):
     underflow: float
 
     def none(self) -> StackedLayers:
-        """No layer, with columns of the same type."""
+        """Return an empty stack of layers, with columns of the same type."""
         return self._replace(shapes=self.shapes[:0], begins=self.begins[:0])
 
 
@@ -202,7 +202,7 @@ def _keep(found, begin, out, columns, terms):
 
 @njit(cache=True, error_model="numpy")
 def through_layers(z, encoded, remainder, layers, last, grid, limit, out, outputs):
-    """Layers with their activations and a last one without, the pieces in the order in which they are given.
+    """Return layers with their activations and a last one without, the pieces in the order in which they are given.
 
     Args:
         z: `PostActivation` of B pieces.

@@ -141,7 +141,7 @@ class SampleCellBounds:
         return self._levels[level]
 
     def _rows(self, level: int, items: RayCells) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Index, for arrays by sample, ray and part, of the parts [k, parts of a cell] of the cells ``items``."""
+        """Return index arrays, by sample, ray and part, of the parts [k, parts of a cell] of the cells ``items``."""
         return items.sample[:, None], items.ray[:, None], self._level(level)[2][items.cell]
 
     def _bound_block(self, block: np.ndarray) -> None:
@@ -220,7 +220,7 @@ class SampleCellBounds:
             rays = np.unique(ray)
 
     def _cell_of(self, level: int) -> np.ndarray:
-        """[parts] the cell of ``level`` that every part lies in."""
+        """Return [parts] numbers of the cells of ``level`` in which the parts lie."""
         members = self._level(level)[2]
         return np.argsort(members, axis=None) // members.shape[1]
 
@@ -245,7 +245,7 @@ class SampleCellBounds:
         return low - rest, high + rest, light * (self.open[:, rays] * span + alpha_high * self.vague[:, rays])
 
     def _anywhere(self, values: np.ndarray, end: np.ufunc, axis: int = -1) -> np.ndarray:
-        """``values`` by part, or for bins their ``end`` (minimum, maximum) over all parts of the same bin.
+        """Return ``values`` by part, or for bins their ``end`` (minimum, maximum) over all parts of the same bin.
 
         With hierarchical sampling the last axis of parts is the place in the bin, where a sample may be anywhere.
         """
@@ -257,7 +257,7 @@ class SampleCellBounds:
         return np.repeat(end.reduce(values.reshape(shape), axis=axis + 1), inner, axis=axis)
 
     def _mixtures(self, rays: np.ndarray | slice, apart: bool) -> tuple[np.ndarray, np.ndarray, np.ndarray | float]:
-        """Bounds of the colours of samples or bins, and a radius that the composited bounds must be widened by (F10).
+        """Return bounds of the colours of samples or bins, and the radius that composited bounds are widened by (F10).
 
         ``apart``: parts of a bin of negligible weight widen the result instead of the bin's colour.
         """
@@ -274,7 +274,7 @@ class SampleCellBounds:
         return np.where(alone, 0.0, low), np.where(alone, 1.0, high), (rest * KEPT_LIGHT_UP)[..., None]
 
     def _background(self, count: int) -> np.ndarray:
-        """Background colour, repeated to [count, parts, 3]."""
+        """Return the background colour, repeated to [count, parts, 3]."""
         return np.tile(np.array(self.owner.sampling.background, np.float64), (count, self.light.shape[1], 1))
 
     def _bound_batch(self, level: int, items: RayCells, coarse: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -297,7 +297,7 @@ class SampleCellBounds:
     def _occupied(
         self, level: int, items: RayCells, lines: np.ndarray, radius: np.ndarray
     ) -> tuple[np.ndarray, np.ndarray]:
-        """Indices of ``items`` that may meet occupied voxels, and [k] whether all of an item lies in such (F11).
+        """Return numbers of ``items`` that may meet occupied voxels, and [k] whether an item lies in these alone (F11).
 
         The other items' opacities are set to 0. ``lines``, ``radius``: see `RayBundle.points`.
         """
@@ -318,7 +318,7 @@ class SampleCellBounds:
     def _bound_field(
         self, level: int, items: RayCells, lines: np.ndarray, radius: np.ndarray, sure: np.ndarray, coarse: float
     ) -> tuple[np.ndarray, np.ndarray]:
-        """First two masks of `_bound_batch`, from the network; where not ``sure`` [k], density may also be 0."""
+        """Return the first two masks of `_bound_batch`, by the network; if not ``sure`` [k], density may be 0, too."""
         device, field = self.owner.device, self.field
         monomials, bernstein, _ = self._level(level)
         self.cells += len(items)
@@ -365,7 +365,7 @@ class SampleCellBounds:
         return halve, lost
 
     def _leave_alike(self, level: int, items: RayCells, density: PreActivation) -> np.ndarray:
-        """[k] whether an item's opacity is negligible on the whole cell; if so, only its upper bound is stored."""
+        """Return [k] whether an opacity is negligible on the whole cell; if so, only its upper bound is stored."""
         length = torch.from_numpy(self.owner.lengths[items.sample]).to(density.poly.device)
         most = opacity(greatest(density)[:, 0], length, up=True)
         alike = ((most <= RAY_TUNING.alike * self.tolerance) & ~density.failed).cpu().numpy()
@@ -420,7 +420,7 @@ class SampleCellBounds:
         upper[rows] = np.where(crossed, old_high, high)
 
     def _shifted(self, color: tuple[np.ndarray, np.ndarray], shift: Shifts) -> tuple[np.ndarray, np.ndarray]:
-        """Bounds of ``color`` (lower, upper) after ``shift`` of hue and saturation; [0, 1] for negligible weights."""
+        """Return bounds of ``color`` after ``shift`` of hue and saturation; [0, 1] for negligible weights."""
         visible = self.before * self.alpha_high > RAY_TUNING.unseen
         low, high = np.zeros_like(color[0]), np.ones_like(color[1])
         low[visible], high[visible] = shifted_bounds(color[0][visible], color[1][visible], *shift)
@@ -438,7 +438,7 @@ class SampleCellBounds:
         return low, high
 
     def _sampled(self, edges_low: np.ndarray, edges_high: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Bounds [n, parts, 3] of the rays' colours by part, from bounds of the fine samples' edges (F14)."""
+        """Return bounds [n, parts, 3] of the rays' colours by part, from bounds of the fine samples' edges (F14)."""
         owner, inner = self.owner, self.division.parts[-1]
         rows, samples, n = len(edges_low), self.alpha_low.shape[0], self.alpha_low.shape[1]
 
@@ -474,7 +474,7 @@ class SampleCellBounds:
         return low, high
 
     def _composited(self, apart: bool) -> tuple[np.ndarray, np.ndarray]:
-        """Bounds [n, parts, 3] of the rays' colours by part, sample by sample (F8); ``apart``: see `_mixtures`."""
+        """Return bounds [n, parts, 3] of the rays' colours by part, sample by sample (F8); see `_mixtures`."""
         low, high = self._background(len(self.light)), self._background(len(self.light))
         color_low, color_high, rest = self._mixtures(slice(None), apart)
         for k in range(self.alpha_low.shape[0] - 1, -1, -1):

@@ -71,7 +71,7 @@ class SampleLines:
 
     @staticmethod
     def around(low: np.ndarray, high: np.ndarray, counts: tuple[int, ...], straight: bool, far: float) -> SampleLines:
-        """Lines that enclose the bounds ``low``, ``high`` [k, parts, S] of midpoints on equal parts of k cells.
+        """Return lines that enclose the bounds ``low``, ``high`` [k, parts, S] of midpoints on equal parts of k cells.
 
         ``counts`` are the parts by axis. ``straight``: slopes are 0. ``far``: the largest distance, for rounding.
         """
@@ -150,12 +150,12 @@ class SamplePaths:
 
     @staticmethod
     def base(field: FieldBounds, nodes: np.ndarray, radius: np.ndarray) -> tuple[PostActivation, PreActivation]:
-        """`FieldBounds.base` of points ``nodes`` [k, nodes, 3] with error bounds ``radius`` [k, 3]."""
+        """Return `FieldBounds.base` of points ``nodes`` [k, nodes, 3] with error bounds ``radius`` [k, 3]."""
         there, around = (torch.from_numpy(a).to(field.device) for a in (nodes, radius))
         return field.base(*field.encode(there, around, field.position))
 
     def look(self, field: FieldBounds, nodes: np.ndarray, radius: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """[k] whether points of a piece may, and whether all of them must, lie in occupied voxels (F11).
+        """Return [k] whether points of a piece may, and [k] whether all of them must, lie in occupied voxels (F11).
 
         ``nodes`` [k, nodes, 3] are the points at the nodes of ``field``'s basis, ``radius`` [k, 3] their error bounds.
         """
@@ -186,7 +186,7 @@ class _Level(NamedTuple):
 
     @staticmethod
     def of(division: Division, level: int) -> _Level:
-        """The cells of ``level`` of a ``division``."""
+        """Return the cells of ``level`` of a ``division``."""
         inner, most = division.inner(level), _INNER.get(division.dimensions, _INNER_MORE)
         counts = tuple(max(k for k in range(1, most + 1) if n % k == 0) for n in inner)
         part = np.arange(math.prod(counts)).reshape(counts)
@@ -243,7 +243,7 @@ class BundleBounds:
         return RayCells(np.repeat(rays, cells), np.tile(np.arange(cells), rays.size))
 
     def samples(self, level: int, cells: RayCells) -> FollowedSamples:
-        """Bounds of all samples of the given ``cells`` of one level."""
+        """Return bounds of all samples of the given ``cells`` of one level."""
         owner, radii = self.owner, (self._radii[0], self._radii[1][cells.ray])
         counts = self._level(level).counts
         low, high = owner.edges(*self._at(owner.coarse, level, cells), radii, counts)
@@ -255,7 +255,7 @@ class BundleBounds:
         return self._levels[level]
 
     def _at(self, field: FieldBounds, level: int, cells: RayCells) -> tuple[np.ndarray, np.ndarray]:
-        """Origins and directions [k, nodes, 3] of ``cells`` at a field's nodes."""
+        """Return origins and directions [k, nodes, 3] of ``cells`` at a field's nodes."""
         d = self.division.dimensions
         low, high = (ends[cells.cell] for ends in self._level(level).boxes)
         places = 0.5 * (low + high)[:, None] + 0.5 * (high - low)[:, None] * field.basis.nodes[:, :d]

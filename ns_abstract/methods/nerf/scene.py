@@ -66,7 +66,7 @@ class Waves(NamedTuple):
 
 
 def _waves(encoding: Encoding, layers: Sequence[Layer]) -> Waves:
-    """`Waves` that have a nonzero weight in one of ``layers``, whose first inputs are the encoded vector."""
+    """Return `Waves` that have a nonzero weight in one of ``layers``, whose first inputs are the encoded vector."""
     looks = np.any([layer.weight[:, : encoding.size].any(axis=0) for layer in layers], axis=0)
     places = np.arange(encoding.size - 3).reshape(2, 3, encoding.count)
     used = looks[places].any(axis=(0, 1))
@@ -93,7 +93,7 @@ class FieldWeights:
     direction: Encoding
 
     def arrays(self) -> list[Float32Array]:
-        """All weights and biases in a fixed order."""
+        """Return all weights and biases in a fixed order."""
         layers = (*self.base, self.density, *self.head, self.color)
         return [array for layer in layers for array in (layer.weight, layer.bias)]
 

@@ -104,7 +104,7 @@ class PoseStrips:
         self.effort: float | None = None
 
     def layout(self) -> StripLayout:
-        """Strips narrow enough for the field's bounds, as a trial on a few rays in the middle of the set shows."""
+        """Return strips narrow enough for the field's bounds, by a trial on a few rays in the middle of the set."""
         if self._layout is None:
             tried = self.pixels[np.unique(np.linspace(0, len(self.pixels) - 1, _TRIED).astype(int))]
             displacement = self._displacement
@@ -145,7 +145,7 @@ class PoseStrips:
         return StripLayout(tuple(counts), division, displacement)
 
     def _strip(self, counts: Sequence[int], place: Sequence[int]) -> ParameterBox:
-        """The strip ``place`` of ``counts`` along each parameter; neighbours share their ends exactly."""
+        """Return the strip ``place`` of ``counts`` along each parameter; neighbours share their ends exactly."""
         box = self.poses
         for axis, (count, k) in enumerate(zip(counts, place, strict=True)):
             ends = self._ends(axis, count, k, k + 1)
@@ -153,7 +153,7 @@ class PoseStrips:
         return box
 
     def _ends(self, axis: int, count: int, first: int, past: int) -> np.ndarray:
-        """Edges [past - first + 1] of the strips ``first`` to ``past`` (exclusive) of ``count`` along an axis."""
+        """Return the edges [past - first + 1] of the strips ``first`` to ``past`` (exclusive) of ``count``."""
         low, high = self.poses.lower[axis], self.poses.upper[axis]
         ends = low + (high - low) * (np.arange(first, past + 1) / count)
         return np.where(np.arange(first, past + 1) == count, high, ends)
@@ -163,7 +163,7 @@ class PoseStrips:
         return tuple(n * finer**level for n in self.layout().counts)
 
     def _shift_ends(self, level: int) -> list[np.ndarray]:
-        """Edges of a level's parts of the ranges of hue and saturation (`hsv.shift_ends`)."""
+        """Return edges of a level's parts of the ranges of hue and saturation (`hsv.shift_ends`)."""
         return shift_ends(self.pose_set.box, self.pose_set.fixed, _SHIFT_PARTS * _SHIFT_FINER**level)
 
     def _call(
@@ -173,7 +173,7 @@ class PoseStrips:
         return self.geometry, strip, pixels, TOLERANCES[level], known, None, shifts, layout.division
 
     def _ensure(self, level: int, place: tuple[int, ...], groups: Sequence[int]) -> list[_StripBounds]:
-        """Bounds of ``groups`` of rays over the strip ``place`` of a level; those not in the cache are computed."""
+        """Return bounds of ``groups`` of rays over the strip ``place`` of a level, cached or computed."""
         computed: dict[int, _StripBounds] = {}
         missing = []
         for group in groups:
@@ -217,7 +217,7 @@ class PoseStrips:
         return strip_bounds
 
     def levels(self, box: ParameterBox) -> int:
-        """Number of levels of use for the cell ``box``: up to the first with strips under half of its width."""
+        """Return the number of useful levels for the cell ``box``: up to strips under half of its width."""
         for level in range(1, len(TOLERANCES)):
             for axis, count in enumerate(self._counts(level)):
                 width = (self.poses.upper[axis] - self.poses.lower[axis]) / count
@@ -228,7 +228,7 @@ class PoseStrips:
     def cell_bounds(
         self, box: ParameterBox, weigh: PixelWeightSource | None, most_rays: int | None = None
     ) -> tuple[list[np.ndarray], np.ndarray, np.ndarray]:
-        """Linear bounds of t rays over a cell (A_lower, b_lower, A_upper, b_upper), and lower and upper bounds.
+        """Return linear bounds of t rays over a cell (A_lower, b_lower, A_upper, b_upper), and lower and upper bounds.
 
         Shapes are [t, 3, d] (A) and [t, 3]. The rays are all, or the first ones: ``most_rays``, or a few more.
 
@@ -262,7 +262,7 @@ class PoseStrips:
     def _level_sets(
         self, box: ParameterBox, level: int, groups: np.ndarray
     ) -> tuple[list[np.ndarray], np.ndarray, np.ndarray]:
-        """`cell_bounds` of the rays of the ``groups``, from strips of one ``level``."""
+        """Return `cell_bounds` of the rays of the ``groups``, by strips of one ``level``."""
         counts = self._counts(level)
         ranges = [self._overlapped(axis, count, box) for axis, count in enumerate(counts)]
         parts = self.layout().division.parts[: self.poses.dimensions]
@@ -294,7 +294,7 @@ class PoseStrips:
         return list(linear), values[0].min(axis=axes), values[1].max(axis=axes)
 
     def _overlapped(self, axis: int, count: int, box: ParameterBox) -> tuple[int, int]:
-        """First and past-the-last number of the strips along an axis that the cell overlaps by more than an end."""
+        """Return the first and past-the-last number of the strips that overlap the cell by more than an end."""
         low, high = self.poses.lower[axis], self.poses.upper[axis]
         first = math.floor((box.lower[axis] - low) / (high - low) * count)
         past = math.ceil((box.upper[axis] - low) / (high - low) * count)
@@ -305,7 +305,7 @@ class PoseStrips:
         return first + max(0, begin), first + max(end, begin + 1)
 
     def _part_ends(self, axis: int, count: int, first: int, past: int, parts: int) -> np.ndarray:
-        """Edges of the parts of the strips from ``first`` to ``past`` (exclusive), in the parameter's unit."""
+        """Return edges of the parts of the strips from ``first`` to ``past`` (exclusive), in the parameter's unit."""
         ends = self._ends(axis, count, first, past)
         inner = np.arange(parts) / parts
         inner_ends = ends[:-1, None] + (ends[1:] - ends[:-1])[:, None] * inner
@@ -326,5 +326,5 @@ def _joined(
 
 
 def _widths(linear: Sequence[np.ndarray]) -> np.ndarray:
-    """[t, 3] mean distances over the cell between the planes b_lower, b_upper of `PoseStrips.cell_bounds`."""
+    """Return [t, 3] mean distances over the cell between the planes b_lower, b_upper of `PoseStrips.cell_bounds`."""
     return linear[3].astype(np.float64) - linear[1]

@@ -25,7 +25,7 @@ class WhiteSamples:
     nearer: np.ndarray
 
     def at(self, points: Tensor, distances: Tensor) -> Tensor:
-        """Colours [..., 3], 1 if selected and else 0, of samples at ``points`` [..., 3] and ``distances`` [...]."""
+        """Return colours [..., 3], 1 if selected, else 0, of samples at ``points`` [..., 3] and ``distances`` [...]."""
         low, high, nearer = (torch.from_numpy(v).to(points) for v in (self.lower, self.upper, self.nearer))
         there = points[..., None, :]
         inside = ((there >= low) & (there <= high)).all(dim=-1)

@@ -46,7 +46,7 @@ def write_nerf_run(
 
 
 def _pipeline(scene: NerfScene) -> dict[str, ArrayLike]:
-    """The fields' arrays under Nerfstudio's names."""
+    """Return the fields' arrays under Nerfstudio's names."""
     return {
         f"field_{name}.{key}": array
         for name, weights in (("coarse", scene.coarse), ("fine", scene.fine))
@@ -55,13 +55,13 @@ def _pipeline(scene: NerfScene) -> dict[str, ArrayLike]:
 
 
 def field_states(names: Sequence[str]) -> dict[str, Any]:
-    """Initial optimizer states of the parameter groups ``names``."""
+    """Return the initial optimizer states of the parameter groups ``names``."""
     group = {"lr": 0.0005, "betas": (0.9, 0.999), "eps": 1e-8, "weight_decay": 0, "params": []}
     return {name: {"state": {}, "param_groups": [group]} for name in names}
 
 
 def _named(weights: FieldWeights) -> dict[str, ArrayLike]:
-    """The arrays of a field under the names of Nerfstudio's ``NeRFField``."""
+    """Return the arrays of a field under the names of Nerfstudio's ``NeRFField``."""
     layers = {f"mlp_base.layers.{i}": layer for i, layer in enumerate(weights.base)}
     layers["field_output_density.net"] = weights.density
     layers |= {f"mlp_head.layers.{i}": layer for i, layer in enumerate(weights.head)}
@@ -130,7 +130,7 @@ class _Shown:
 
 
 def _grid(encoding: HashEncoding) -> dict[str, int]:
-    """Settings of a hash grid by Nerfstudio's names; max_res is the least that yields the grid's resolutions.
+    """Return settings of a hash grid by their names in Nerfstudio, with the least max_res that gives its resolutions.
 
     Raises ValueError: none does.
     """
@@ -150,7 +150,7 @@ def _grid(encoding: HashEncoding) -> dict[str, int]:
 
 
 def _arrays(scene: NerfactoScene) -> dict[str, ArrayLike]:
-    """The arrays of the fields under Nerfstudio's names, float32."""
+    """Return the arrays of the fields under Nerfstudio's names, float32."""
     field = scene.field
     arrays: dict[str, ArrayLike] = {"field.aabb": np.array([[-1.0] * 3, [1.0] * 3], np.float32)}
 

@@ -58,12 +58,12 @@ Encoded = tuple[Tensor, Tensor]
 
 
 def _rounding(inputs: int) -> float:
-    """Relative error of a layer with so many ``inputs``: of sums here and of a concrete float64 evaluation together."""
+    """Return the relative error of a layer with so many ``inputs``: of these sums and a float64 evaluation together."""
     return 2.0 * gamma(inputs + 4)
 
 
 def _before(pieces: PostActivation, kind: torch.dtype) -> PostActivation:
-    """``pieces`` as NumPy arrays for compiled layers, with columns of the type ``kind``."""
+    """Return ``pieces`` as NumPy arrays for compiled layers, with columns of the type ``kind``."""
     return PostActivation(*(tensor.numpy() for tensor in pieces._replace(columns=pieces.columns.to(kind))))
 
 
@@ -84,7 +84,7 @@ class _FieldLayer:
 
 
 def _seeing(layer: Layer, encoding: Encoding, waves: Waves) -> Layer:
-    """``layer``, whose first inputs are the encoded vector, without the inputs that are not among ``waves``."""
+    """Return ``layer``, whose first inputs are the encoded vector, without the inputs outside of ``waves``."""
     columns = np.concatenate([waves.columns, np.arange(encoding.size, layer.weight.shape[1])])
     return replace(layer, weight=np.ascontiguousarray(layer.weight[:, columns]))
 
@@ -137,7 +137,7 @@ class FieldBounds:
         self._bernstein: dict[tuple[int, ...], Tensor] = {}
 
     def bernstein(self, parts: tuple[int, ...]) -> Tensor:
-        """`ChebyshevBasis.bernstein` of the basis for ``parts`` by axis, cached."""
+        """Return `ChebyshevBasis.bernstein` of the basis for ``parts`` by axis, cached."""
         if parts not in self._bernstein:
             self._bernstein[parts] = torch.from_numpy(self.basis.bernstein(parts)).to(self.device)
         return self._bernstein[parts]
@@ -154,7 +154,7 @@ class FieldBounds:
         return _FieldLayer(seen_inputs, weight, weight.abs(), bias, lines, lines.float() if narrow else None)
 
     def encode(self, nodes: Tensor, radius: Tensor, seen: Waves) -> tuple[Tensor, Tensor]:
-        """Polynomials and remainders of an encoded vector (design.md, F3).
+        """Return polynomials and remainders of an encoded vector (design.md, F3).
 
         Returns [B, m, k] coefficients and [B, k] remainders of the k components ``seen``.
 
@@ -210,7 +210,7 @@ class FieldBounds:
         return PreActivation(poly, columns, owner, spread, box * FIELD_UP, pieces.failed, pieces.count)
 
     def _weights(self, layer: _FieldLayer) -> LayerWeights:
-        """``layer`` as arrays for compiled products."""
+        """Return ``layer`` as arrays for compiled products."""
         seen_inputs, narrow = layer.seen, layer.narrow is not None
         kind = layer.lines if layer.narrow is None else layer.narrow
         lines, absolute = layer.lines.numpy(), layer.absolute.numpy()
@@ -227,7 +227,7 @@ class FieldBounds:
         )
 
     def _linear_compiled(self, pieces: PostActivation, layer: _FieldLayer, first: Encoded) -> PreActivation:
-        """`_linear` by compiled kernels."""
+        """Return `_linear` by compiled kernels."""
         encoded, remainder = (a.contiguous() for a in first)
         (batch, m, _), n = pieces.poly.shape, layer.weight.shape[1]
         total = pieces.owner.shape[0] + pieces.new_owner.shape[0]
@@ -275,7 +275,7 @@ class FieldBounds:
         return out, PreActivation(poly, out.columns[:0, :0], out.owner[:0], sums, radius, out.failed, out.count)
 
     def _relu(self, z: PreActivation) -> PostActivation:
-        """Zonotopes behind a ReLU of the zonotopes ``z`` (design.md, F5)."""
+        """Return zonotopes behind a ReLU of the zonotopes ``z`` (design.md, F5)."""
         rho = z.spread * FIELD_UP
         poly, box = z.poly, z.box
         spread = poly[:, 1:].abs().sum(dim=1) * FIELD_UP
@@ -354,7 +354,7 @@ class FieldBounds:
         return q, error
 
     def _least(self, values: Tensor) -> Tensor:
-        """[k, cells] least of ``values`` [k, g] at the corners of every interval (rectangle, ...) of the grid."""
+        """Return the [k, cells] least of ``values`` [k, g] at the corners of every interval (or box) of the grid."""
         side, d = self.basis.grid + 1, self.basis.dimensions
         if d == 0:
             return values
@@ -364,7 +364,7 @@ class FieldBounds:
         return grid.flatten(1)
 
     def base(self, poly: Tensor, remainder: Tensor) -> tuple[PostActivation, PreActivation]:
-        """Zonotopes of the base network's outputs from an encoded position (`encode`), and of the density's output.
+        """Return zonotopes of the base network's and of the density's outputs, from an encoded position (`encode`).
 
         The latter is before softplus, one output, and without columns.
         """
@@ -393,7 +393,7 @@ class FieldBounds:
         return stacked([self._weights(layer) for layer in self._head]), stacked([self._weights(self._color)])
 
     def _nothing(self, poly: Tensor) -> PostActivation:
-        """`PostActivation` of B pieces without neurons, as many pieces as ``poly`` [B, m, k] has."""
+        """Return a `PostActivation` of B pieces without neurons, as many pieces as ``poly`` [B, m, k] has."""
         none = poly[:, 0, :0]
         index = torch.zeros(0, dtype=torch.int64, device=self.device)
         failed = torch.zeros(len(poly), dtype=torch.bool, device=self.device)
@@ -403,7 +403,7 @@ class FieldBounds:
         )  # fmt: skip
 
     def color(self, pieces: PostActivation, poly: Tensor, remainder: Tensor) -> PreActivation:
-        """Zonotopes, without columns, of RGB before the sigmoid, from base outputs and an encoded direction."""
+        """Return zonotopes, without columns, of RGB before the sigmoid, from base outputs and an encoded direction."""
         first = poly, remainder
         if self._grid is not None:
             return self._through(pieces, *self._head_stacks, first, self._grid)[1]

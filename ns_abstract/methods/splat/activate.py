@@ -47,7 +47,7 @@ class Splats:
 
 
 def rotation_matrices(quats: Float64Array) -> Float64Array:
-    """[N, 3, 3] rotations of the quaternions [N, 4] (w, x, y, z), normalised here (utils.cuh:14-35)."""
+    """Return the [N, 3, 3] rotations of quaternions [N, 4] (w, x, y, z), normalised here (utils.cuh:14-35)."""
     w, x, y, z = (quats / np.sqrt(np.sum(quats * quats, axis=1, keepdims=True))).T
     rows = [
         [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
@@ -58,7 +58,7 @@ def rotation_matrices(quats: Float64Array) -> Float64Array:
 
 
 def used_degree(scene: SplatScene, rasteriser: Rasteriser) -> int:
-    """The highest SH band with a coefficient other than zero, at most what is evaluated."""
+    """Return the highest SH band with a nonzero coefficient, at most the evaluated one."""
     if scene.color_model == "sigmoid" or not rasteriser.view_dependent:
         return 0
     for degree in range(scene.sh_degree, 0, -1):

@@ -67,7 +67,7 @@ def _product(s, n, left, right, factor):
 
 @njit(cache=True, error_model="numpy", forceinline=True)
 def _shifted_square(s, n, left, factor, shift):
-    """``left (factor z^2 + shift)``."""
+    """Return ``left (factor z^2 + shift)``."""
     for q in range(n):
         inner = combined(load(s, _Z2, LANES, q), factor, LineForm(shift, 0.0, 0.0, 0.0), 1.0)
         store(multiplied(load(s, left, LANES, q), inner), s, _BASIS, LANES, q)

@@ -203,14 +203,14 @@ def view_limits(rules, camera):
 
 @njit(cache=True, error_model="numpy", forceinline=True)
 def _axis_sizes(s, k, q):
-    """Absolute entries of principal axis ``k``."""
+    """Return the absolute entries of principal axis ``k``."""
     at = B00 + 3 * k * LANES + q
     return abs(s[at]), abs(s[at + LANES]), abs(s[at + 2 * LANES])
 
 
 @njit(cache=True, error_model="numpy")
 def float_errors(s, n, rules, camera, charges, rotation_magnitude):
-    """Float errors of mean, covariance and exponent, and the radius' range (design.md, G5-G8): rows ZLOW .. GRAMC.
+    """Return float errors of mean, covariance and exponent, and the radius' range (G5-G8): rows ZLOW .. GRAMC.
 
     Numbers of Gaussians that may come too near are of no use; `regions` does not look at them. The compiler makes
     vector code of the loops as they stand: lanes are Gaussians.

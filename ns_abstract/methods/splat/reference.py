@@ -58,7 +58,7 @@ class Projection:
 
 
 def rotations(quats: Tensor) -> Tensor:
-    """[N, 3, 3] rotation matrices of the quaternions [N, 4] (w, x, y, z), normalised here.
+    """Return the [N, 3, 3] rotation matrices of quaternions [N, 4] (w, x, y, z), normalised here.
 
     ``R v = v + 2 w (u x v) + 2 u x (u x v)`` with ``u = (x, y, z)``; equal to utils.cuh:14-35.
     """
@@ -70,7 +70,7 @@ def rotations(quats: Tensor) -> Tensor:
 
 
 def sh_colors(degree: int, directions: Tensor, sh: Tensor) -> Tensor:
-    """``max(0, 0.5 + sum_k Y_k(direction) sh_k)`` [n, 3] (rendering.py:382-392 of gsplat).
+    """Return ``max(0, 0.5 + sum_k Y_k(direction) sh_k)`` [n, 3] (rendering.py:382-392 of gsplat).
 
     ``directions`` [n, 3] lead from the camera, of any length, world axes; ``sh`` is [n, K, 3] with K >= (degree + 1)^2,
     for a ``degree`` from 0 to 3.

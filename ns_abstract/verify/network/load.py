@@ -71,7 +71,7 @@ def load_network(
 
 
 def network_stamp(network: Network) -> dict[str, Any]:
-    """``name``, ``bytes`` and ``sha256`` of the network's file; ``data``: sums of files beside it with its constants.
+    """Return ``name``, ``bytes`` and ``sha256`` of the network's file, and ``data``: sums of files with its constants.
 
     ``data`` is left out where the file holds all constants.
 

@@ -74,7 +74,7 @@ def parse_model(path: Path) -> onnx.ModelProto:
 
 
 def number_type(data_type: int) -> np.dtype:
-    """numpy's type of an ONNX type (N23). Raises InputError where numpy holds its bits, or a wider type, instead."""
+    """Return numpy's type of an ONNX type (N23). Raises InputError where numpy holds its bits, or a wider type."""
     if data_type not in _TYPES:
         named = data_type in _T.DataType.values()
         name = _T.DataType.Name(data_type) if named else str(data_type)  # pyright: ignore[reportArgumentType]

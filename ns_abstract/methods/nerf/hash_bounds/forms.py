@@ -212,7 +212,7 @@ def exp_band(center, low, high):
 
 @njit(cache=True, error_model="numpy", **UNCOUNTED)
 def sigmoid(x):
-    """The logistic function, up to a relative error of 2^-48."""
+    """Return the logistic function, up to a relative error of 2^-48."""
     if x >= 0.0:
         return 1.0 / (1.0 + exp_kernel(-min(x, _MOST)))
     e = exp_kernel(max(x, _LEAST))

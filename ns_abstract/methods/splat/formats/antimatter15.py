@@ -21,7 +21,7 @@ _FIELDS = {name: f"{name} of a row" for name in ("scales", "quats", "opacities",
 
 
 def decode_splat(path: Path, overrides: Overrides) -> DecodedSplats:
-    """The Gaussians of a .splat file. Raises InputError: its size is not that of whole rows, or it cannot be read."""
+    """Return the Gaussians of a .splat file. Raises InputError: damaged, or of a size that is not whole rows."""
     size = file_size(path, ".splat file")
     if size % _ROW.itemsize:
         problem = f"{size} bytes, not a multiple of {_ROW.itemsize}: not a .splat file, or cut off"

@@ -44,7 +44,7 @@ def is_compressed(elements: list[PlyElement]) -> bool:
 
 
 def decode_compressed_ply(path: Path, elements: list[PlyElement], mode: str | None, comment: str) -> DecodedSplats:
-    """The Gaussians of a compressed .ply.
+    """Return the Gaussians of a compressed .ply.
 
     ``elements``: what its header declares, checked against the file's size. ``mode``: "classic" or "antialiased" where
     a comment says it. Raises InputError where the elements are not those of the format, or the file is damaged.
@@ -99,13 +99,13 @@ _HARMONICS = _harmonics()
 
 
 def _unpack(values: Any) -> list[NDArray[np.float64]]:
-    """Numbers of 11, 10 and 11 bits as parts of 1."""
+    """Return numbers of 11, 10 and 11 bits as fractions of their largest values."""
     value = values.astype(np.int64)
     return [(value >> 21 & 2047) / 2047.0, (value >> 11 & 1023) / 1023.0, (value & 2047) / 2047.0]
 
 
 def _check(elements: list[PlyElement], path: Path) -> tuple[int, int]:
-    """Number of Gaussians and of bands."""
+    """Return the number of Gaussians and of bands."""
     by_name = {element.name: element for element in elements}
     if (
         set(by_name) - {"vertex", "chunk", "sh"}

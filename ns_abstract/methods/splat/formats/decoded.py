@@ -66,7 +66,7 @@ class DecodedSplats:
 
 
 def scene_of(decoded: DecodedSplats, overrides: Overrides) -> SplatScene:
-    """The scene of decoded Gaussians, with what the user says in place of the file.
+    """Return the scene of decoded Gaussians; what the user states replaces what the file states.
 
     Raises:
         InputError: A Gaussian cannot be bounded.
@@ -115,7 +115,7 @@ def reserve(count: int, bands: int, file: Path, more: int = 0) -> None:
 def float32_rows(
     means: Any, log_scales: Any, quats: Any, opacity_logits: Any, colors: Any, rest: Any | None = None
 ) -> StoredGaussians:
-    """Rows rounded once to float32.
+    """Return rows rounded once to float32.
 
     ``means`` and ``log_scales`` are [N, 3], ``quats`` [N, 4] (w, x, y, z), ``opacity_logits`` [N], ``colors`` [N, 3]
     coefficients of band 0, ``rest`` [N, K - 1, 3] those of the other bands; None: there are none.
@@ -132,7 +132,7 @@ def float32_rows(
 
 
 def opacity_logits(values: Bytes) -> NDArray[np.float64]:
-    """Logits of opacities of one byte each, of the same shape."""
+    """Return logits of opacities of one byte each, of the same shape."""
     table = np.empty(256)
     inside = np.arange(1, 255)
     table[1:255] = np.log(inside / (255.0 - inside))
@@ -141,7 +141,7 @@ def opacity_logits(values: Bytes) -> NDArray[np.float64]:
 
 
 def smallest_three(parts: NDArray[np.float64], largest: NDArray[np.int64]) -> NDArray[np.float64]:
-    """Unit quaternions [N, 4] of which the ``largest`` [N] component, 0 to 3, is left out; it is not negative.
+    """Return unit quaternions [N, 4] of which the ``largest`` [N] component, 0 to 3, is left out; it is not negative.
 
     ``parts`` [N, 3] are the other components, in the order of their places.
     """
@@ -155,7 +155,7 @@ def smallest_three(parts: NDArray[np.float64], largest: NDArray[np.int64]) -> ND
 
 
 def lossless_picture(data: bytes, name: str, least: int, most: int, file: Path) -> Bytes:
-    """Texels [H, W, 4] of a lossless WebP or PNG picture.
+    """Return texels [H, W, 4] of a lossless WebP or PNG picture.
 
     Raises:
         InputError: Not such a picture, of another size, or damaged.

@@ -53,7 +53,7 @@ _LIMIT = 40.0
 
 
 def decode_glb(path: Path, overrides: Overrides) -> DecodedSplats:
-    """The Gaussians of a .glb file.
+    """Return the Gaussians of a .glb file.
 
     Raises:
         InputError: The file is damaged, holds no or other Gaussians, or other things beside them.
@@ -100,7 +100,7 @@ def decode_glb(path: Path, overrides: Overrides) -> DecodedSplats:
 
 
 def _chunks(path: Path) -> tuple[dict[str, Any], bytes]:
-    """The JSON and the binary chunk."""
+    """Return the JSON and the binary chunk."""
     size = file_size(path, ".glb file")
     check_memory(size, path, "the file")
     with path.open("rb") as stream:
@@ -138,7 +138,7 @@ def _list(value: Any, name: str) -> list[dict[str, Any]]:
 
 
 def _primitive(root: dict[str, Any]) -> dict[str, int]:
-    """The attributes of the one primitive of Gaussians, in a node that does not move it."""
+    """Return the attributes of the one primitive of Gaussians, in a node that does not move it."""
     required = root.get("extensionsRequired", [])
     if not isinstance(required, list) or not set(map(str, required)) <= {_EXTENSION}:
         others = [str(name)[:60] for name in required if name != _EXTENSION] if isinstance(required, list) else required
@@ -191,7 +191,7 @@ def _checked(primitive: dict[str, Any]) -> dict[str, int]:
 
 
 def _harmonics(attributes: dict[str, int]) -> list[str]:
-    """The names of the coefficients in order; unknown attributes are refused."""
+    """Return the names of the coefficients in order; unknown attributes are refused."""
     names: list[str] = []
     for degree in range(4):
         wanted = [f"SH_DEGREE_{degree}_COEF_{k}" for k in range(2 * degree + 1)]
@@ -226,7 +226,7 @@ class _Accessors:
         self.data = np.frombuffer(data, np.uint8, buffers[0]["byteLength"])
 
     def count(self, index: int, name: str) -> int:
-        """Number of rows of an accessor."""
+        """Return the number of rows of an accessor."""
         accessor = self._at(self.accessors, index, name)
         count = accessor.get("count")
         if not _whole(count, len(self.data)):
@@ -242,7 +242,7 @@ class _Accessors:
         types: Sequence[int],
         normalised: bool | None,
     ) -> NDArray[np.float64]:
-        """[count, width] numbers of an attribute."""
+        """Return [count, width] numbers of an attribute."""
         accessor = self._at(self.accessors, attributes[name], name)
         stored = accessor.get("componentType"), accessor.get("type"), accessor.get("count")
         component = stored[0]

@@ -43,7 +43,7 @@ def is_gsplat_checkpoint(path: Path) -> bool:
 
 
 def checkpoint(folder: Path, step: int | None) -> Path | None:
-    """The first rank of a checkpoint in a folder or its ``ckpts``; None where there is none.
+    """Return the first rank of a checkpoint in a folder or its ``ckpts``; None where there is none.
 
     ``step``: whose checkpoint is wanted; None: the last one. Raises InputError where there are checkpoints, but not of
     this step.
@@ -63,7 +63,7 @@ def checkpoint(folder: Path, step: int | None) -> Path | None:
 
 
 def decode_gsplat_checkpoint(path: Path, overrides: Overrides) -> DecodedSplats:
-    """The Gaussians of a checkpoint, of all its ranks.
+    """Return the Gaussians of a checkpoint, of all its ranks.
 
     Raises:
         InputError: A rank is missing, a part changes the picture, or a file is damaged.
@@ -89,7 +89,7 @@ def decode_gsplat_checkpoint(path: Path, overrides: Overrides) -> DecodedSplats:
 
 
 def _ranks(path: Path) -> tuple[Path, ...]:
-    """All ranks of the checkpoint, the one given first."""
+    """Return all ranks of the checkpoint, the one given first."""
     match = _NAME.fullmatch(path.name)
     assert match is not None
     step = match[1]
@@ -149,7 +149,7 @@ def _splats(file: Path) -> dict[str, np.ndarray]:
 
 
 def _config(path: Path) -> tuple[str | None, str, tuple[str, ...]]:
-    """Mode, its origin and notes, from the trainer's configuration where it is there."""
+    """Return the mode, its origin and notes, from the trainer's configuration where that exists."""
     file = next((folder / CONFIG for folder in path.parents[:2] if (folder / CONFIG).is_file()), None)
     if file is None:
         return None, "", (f"{CONFIG} of the trainer is missing: camera model and rasteriser are taken as its defaults",)

@@ -20,7 +20,7 @@ _BACKGROUNDS = {True: (1.0, 1.0, 1.0), False: (0.0, 0.0, 0.0)}
 
 
 def point_cloud(folder: Path, iteration: int | None) -> Path:
-    """The .ply of a trained folder: of ``iteration``, or of the last one. Raises InputError where there is none."""
+    """Return .ply of a trained folder: of ``iteration``, or of the last one. Raises InputError where there is none."""
     clouds = {}
     outer = folder / "point_cloud"
     for inner in outer.iterdir() if outer.is_dir() else ():
@@ -37,7 +37,7 @@ def point_cloud(folder: Path, iteration: int | None) -> Path:
 
 
 def arguments_beside(ply: Path) -> Path | None:
-    """The ``cfg_args`` of the folder that a .ply was trained in; None where it lies elsewhere."""
+    """Return the ``cfg_args`` of the folder that a .ply was trained in; None where it lies elsewhere."""
     place = ply.absolute()
     if place.name != "point_cloud.ply" or not place.parent.name.startswith("iteration_"):
         return None
@@ -46,7 +46,7 @@ def arguments_beside(ply: Path) -> Path | None:
 
 
 def read_arguments(file: Path) -> dict[str, Any]:
-    """The names and literals of ``cfg_args``. Raises InputError where it is not the text of a Namespace of literals."""
+    """Return names and literals of ``cfg_args``. Raises InputError where it is not a Namespace of literals."""
     text = read_text(file, ARGUMENTS, _LIMIT)
     try:
         call = ast.parse(text.strip(), mode="eval").body
@@ -60,7 +60,7 @@ def read_arguments(file: Path) -> dict[str, Any]:
 
 
 def background(arguments: dict[str, Any], file: Path) -> tuple[float, float, float] | None:
-    """The colour behind the scene; None where the arguments say nothing.
+    """Return the colour behind the scene; None where the arguments do not state it.
 
     Raises:
         InputError: It is neither True nor False.

@@ -46,7 +46,7 @@ _FORMATS = (
 
 
 def decoder_of(path: Path) -> Decoder | None:
-    """What decodes a file; None where its format has no decoder here."""
+    """Return the decoder of a file; None where its format has no decoder here."""
     try:
         with path.open("rb") as stream:
             head = stream.read(_HEAD)
@@ -56,7 +56,7 @@ def decoder_of(path: Path) -> Decoder | None:
 
 
 def scene_file(folder: Path, iteration: int | None) -> Path | None:
-    """The scene's file in a folder that another program wrote; None where there is none, so that it may be a run's.
+    """Return the scene's file in a folder that another program wrote; None without one: it may be a run's folder.
 
     The ``folder`` is of Inria's training, of a SOG scene, or of gsplat's trainer (or its ``ckpts``). ``iteration``:
     whose result is wanted; None: the last one. Raises InputError where the iteration is not there.

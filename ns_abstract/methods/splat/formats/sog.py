@@ -57,7 +57,7 @@ def is_archive(path: Path) -> bool:
 
 
 def decode_sog(path: Path, overrides: Overrides) -> DecodedSplats:
-    """The Gaussians of a SOG scene: an archive, its ``meta.json`` outside an archive, or the folder that holds it.
+    """Return the Gaussians of a SOG scene: an archive, its ``meta.json`` outside an archive, or the folder of that.
 
     Raises InputError where it is of another version or model, or damaged.
     """
@@ -107,7 +107,7 @@ class _Description:
         self._count = count
 
     def decoded(self, files: tuple[Path, ...], overrides: Overrides) -> DecodedSplats:
-        """The Gaussians, read from ``files``."""
+        """Return the Gaussians, read from ``files``."""
         mode, origin = self._mode(overrides)
         # as many bands as there can be
         reserve(self._count, 16 if self._meta.get("shN") is not None else 1, self._file, 32 * self._count)
@@ -134,7 +134,7 @@ class _Description:
         )
 
     def _quaternions(self) -> NDArray[np.float64]:
-        """[N, 4]; those of an unknown place are no rotation."""
+        """Return [N, 4] quaternions; those with an unknown place are no rotations."""
         turned = self._texels("quats", 0)
         tag = turned[:, 3].astype(np.int64)
         quats = smallest_three((turned[:, :3] / 255.0 * 2.0 - 1.0) * np.sqrt(0.5), np.maximum(tag - 252, 0))
@@ -142,7 +142,7 @@ class _Description:
         return quats
 
     def _rest(self) -> NDArray[np.float64] | None:
-        """[N, K - 1, 3]: the palette's rows that the labels name; None without further bands."""
+        """Return [N, K - 1, 3] coefficients: the palette's rows that the labels name; None without further bands."""
         section = self._meta.get("shN")
         if section is None or (self._version == 2 and self._item("shN", "bands") == 0):
             return None
@@ -178,7 +178,7 @@ class _Description:
         return _MODES[model], f"meta.json: model {model}"
 
     def _texels(self, section: str, place: int) -> Bytes:
-        """[N, 4]."""
+        """Return the texels [N, 4] of a picture."""
         # writers round the width up, never by as much as this
         return self._picture(section, place, self._count, 2 * self._count + 4096).reshape(-1, 4)[: self._count]
 
@@ -187,7 +187,7 @@ class _Description:
         return lossless_picture(self._read(name), name, least, most, self._file)
 
     def _between(self, section: str, part: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Numbers between the section's limits, of which ``part`` [N, size] says where."""
+        """Return numbers between the section's limits, at fractions ``part`` [N, size]."""
         low, high = (self._numbers(section, end, part.shape[1]) for end in ("mins", "maxs"))
         return low * (1.0 - part) + high * part
 
@@ -201,7 +201,7 @@ class _Description:
         return np.array(values, np.float64)
 
     def _item(self, section: str, key: str, place: int | None = None) -> Any:
-        """What the section holds under ``key``, or its entry ``place``."""
+        """Return the section's value under ``key``, or entry ``place`` of it."""
         return _item(self._meta, self._file, section, key, place)
 
     def _error(self, field: str, value: Any, wanted: str, fix: str = _FIX) -> InputError:
@@ -219,7 +219,7 @@ def _item(meta: dict[str, Any], file: Path, section: str, key: str, place: int |
 
 
 def _names(meta: Any, file: Path) -> list[str]:
-    """The pictures that a description names: plain names, each once."""
+    """Return the pictures that a description names: plain names, each once."""
     if not isinstance(meta, dict):
         raise InputError("the top level is not a mapping", file=file, fix=_FIX)
     if "lodLevels" in meta:
@@ -240,7 +240,7 @@ def _names(meta: Any, file: Path) -> list[str]:
 
 
 def _entries(archive: zipfile.ZipFile, path: Path) -> dict[str, zipfile.ZipInfo]:
-    """Files of an archive by name, all in its top folder or all in one folder."""
+    """Return files of an archive by name, all in its top folder or all in one folder."""
     infos = [info for info in archive.infolist() if not info.is_dir()]
     folders = {info.filename.rpartition("/")[0] for info in infos if info.filename.rpartition("/")[2] == META}
     if len(infos) > 64 or len(folders) > 1:

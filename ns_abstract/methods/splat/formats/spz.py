@@ -56,7 +56,7 @@ class _Header(NamedTuple):
 
 
 def decode_spz(path: Path, overrides: Overrides) -> DecodedSplats:
-    """The Gaussians of an SPZ file. Raises InputError: another version, degree 4, extensions, or a damaged file."""
+    """Return the Gaussians of an SPZ file. Raises InputError: another version, degree 4, extensions, or damaged."""
     size = file_size(path, ".spz file")
     with path.open("rb") as stream:
         head = stream.read(_HEADER_4)
@@ -110,7 +110,7 @@ def _header(head: bytes, path: Path) -> _Header:
 
 
 def _split(header: _Header, data: bytes, path: Path) -> dict[str, NDArray[np.uint8]]:
-    """Streams of versions 2 and 3, one behind the other."""
+    """Return the streams of versions 2 and 3, which follow one another."""
     wanted = sum(header.sizes.values())
     if len(data) != wanted:
         raise InputError(f"{len(data)} bytes of Gaussians or more, expected {wanted}: cut off", file=path, fix=_FIX)
@@ -122,7 +122,7 @@ def _split(header: _Header, data: bytes, path: Path) -> dict[str, NDArray[np.uin
 
 
 def _packed_streams(path: Path, size: int) -> tuple[_Header, dict[str, NDArray[np.uint8]]]:
-    """Header and streams of versions 2 and 3: unpacked only as far as the header says."""
+    """Return header and streams of versions 2 and 3, unpacked only as far as the header says."""
     inflate = zlib.decompressobj(31)
     try:
         with path.open("rb") as stream:
@@ -150,7 +150,7 @@ def _packed_streams(path: Path, size: int) -> tuple[_Header, dict[str, NDArray[n
 
 
 def _streams_4(path: Path, size: int, head: bytes, header: _Header) -> dict[str, NDArray[np.uint8]]:
-    """Streams of version 4."""
+    """Return streams of version 4."""
     if len(head) < _HEADER_4:
         raise InputError(f"{len(head)} bytes: cut off", file=path, fix=_FIX)
     sizes = {name: length for name, length in header.sizes.items() if length}
@@ -197,7 +197,7 @@ def _signed_24(data: NDArray[np.uint8]) -> NDArray[np.float64]:
 
 
 def _quaternions(data: NDArray[np.uint8], version: int) -> NDArray[np.float64]:
-    """[N, 4], (w, x, y, z)."""
+    """Return [N, 4] quaternions, (w, x, y, z)."""
     if version == 2:
         return smallest_three(data.reshape(-1, 3) / 127.5 - 1.0, np.zeros(len(data) // 3, np.int64))
     packed = data.view("<u4").astype(np.int64)
