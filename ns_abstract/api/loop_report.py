@@ -84,7 +84,7 @@ class LoopReport:
                 return
 
     def show_tubes(self, store: Store, deadline: Deadline) -> None:
-        """Tubes of a few certified cells beside simulated runs and what less dependence would give."""
+        """Draw the tubes of a few certified cells beside simulated runs and tubes with less dependence."""
         certified = [row for number in self.job.questions for row in store.leaves(number, "certified")]
         if not certified:
             return
@@ -97,7 +97,7 @@ class LoopReport:
                 return
 
     def make_film(self, store: Store, deadline: Deadline) -> None:
-        """Abstract images along the tube of the widest certified cell of the strongest question, or of the first."""
+        """Make the film: abstract images along the tube of the widest certified cell of the strongest question."""
         job, steps, box = self.job, [], self.job.loop.box
 
         def strongest(kind: Verdict | None) -> list[dict[str, Any]]:

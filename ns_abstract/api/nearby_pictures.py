@@ -223,7 +223,7 @@ class NearbyPictures:
         return self._sets(box, None)[0]
 
     def sub_box_counts(self, box: ParameterBox, most: int) -> np.ndarray | None:
-        """See `ns_abstract.verify.protocol.DividedImages`; none where a claim needs more of pixels than their side."""
+        """Return the numbers of sub-boxes along each parameter; None where a claim needs more than a pixel's side."""
         if self._known.elements is None or not all(one.counts for one in self._measures):
             return None
         whole = self.box
@@ -359,6 +359,6 @@ def place_sets(
     channels: Sequence[int],
     pixels: np.ndarray | None = None,
 ) -> None:
-    """`place` for the four arrays of a picture's linear bounds, its lower and its upper bounds."""
+    """Do `place` for the four arrays of a picture's linear bounds, its lower and its upper bounds."""
     assert bounds.linear is not None
     place(wholes, (*bounds.linear, bounds.lower, bounds.upper), frame, tiles, channels, pixels)

@@ -96,7 +96,7 @@ def set_norms(out, d, order, m):
 
 @njit(cache=True, error_model="numpy")
 def scale_add(a, s, b, t, shift, out, d, order, m):
-    """``out = s * a + t * b + shift`` for numbers s, t, shift (design.md, A1); ``out`` may be ``a`` or ``b``."""
+    """Write ``out = s * a + t * b + shift`` for numbers s, t, shift (design.md, A1); ``out`` may be ``a`` or ``b``."""
     n = out.shape[1]
     absolute_s = abs(s)
     absolute_t = abs(t)
@@ -117,7 +117,7 @@ def scale_add(a, s, b, t, shift, out, d, order, m):
 
 @njit(cache=True, error_model="numpy")
 def multiply(a, b, out, d, order, m):
-    """``out = a * b`` (design.md, A2). ``out`` must be another array than ``a`` and ``b``."""
+    """Write ``out = a * b`` (design.md, A2). ``out`` must be another array than ``a`` and ``b``."""
     n = out.shape[1]
     for q in range(n):
         pa = abs(a[0, q]) + a[m + 1, q] + a[m + 2, q]
@@ -155,7 +155,7 @@ def multiply(a, b, out, d, order, m):
 
 @njit(cache=True, error_model="numpy")
 def compose(a, f0, f1, f2_low, f2_high, f3, out, d, order, m):
-    """``out = f(a)`` from bounds of ``f`` over the range of ``a`` (design.md, A3).
+    """Write ``out = f(a)`` from bounds of ``f`` over the range of ``a`` (design.md, A3).
 
     Args:
         a: Forms [rows, n].
@@ -211,7 +211,7 @@ def compose(a, f0, f1, f2_low, f2_high, f3, out, d, order, m):
 
 @njit(cache=True, error_model="numpy")
 def square(a, out, d, order, m):
-    """``out = a * a``; for order 1 tighter than `multiply`, since ``(g.p)^2`` is never negative."""
+    """Write ``out = a * a``; for order 1 tighter than `multiply`, since ``(g.p)^2`` is never negative."""
     if order == 2:
         multiply(a, a, out, d, order, m)
         return
@@ -283,7 +283,7 @@ def _ends(a, m, q):
 
 @njit(cache=True, error_model="numpy")
 def reciprocal(a, work, out, d, order, m):
-    """``out = 1 / a`` for ``a > 0`` (1e-75 to 1e75); ``work`` is [5, n] scratch."""
+    """Write ``out = 1 / a`` for ``a > 0`` (1e-75 to 1e75); ``work`` is [5, n] scratch."""
     for q in range(out.shape[1]):
         c, (low, high, inside) = a[0, q], _ends(a, m, q)
         f0 = 1.0 / c if inside else 1.0
@@ -301,7 +301,7 @@ def reciprocal(a, work, out, d, order, m):
 
 @njit(cache=True, error_model="numpy")
 def square_root(a, work, out, d, order, m):
-    """``out = sqrt(a)`` for ``a > 0``; ``work`` is [5, n] scratch."""
+    """Write ``out = sqrt(a)`` for ``a > 0``; ``work`` is [5, n] scratch."""
     for q in range(out.shape[1]):
         c, (low, high, inside) = a[0, q], _ends(a, m, q)
         f0 = np.sqrt(c) if inside else 1.0
@@ -318,7 +318,7 @@ def square_root(a, work, out, d, order, m):
 
 @njit(cache=True, error_model="numpy")
 def reciprocal_square_root(a, work, out, d, order, m):
-    """``out = 1 / sqrt(a)`` for ``a > 0``; ``work`` is [5, n] scratch."""
+    """Write ``out = 1 / sqrt(a)`` for ``a > 0``; ``work`` is [5, n] scratch."""
     for q in range(out.shape[1]):
         c, (low, high, inside) = a[0, q], _ends(a, m, q)
         f0 = 1.0 / np.sqrt(c) if inside else 1.0
@@ -336,7 +336,7 @@ def reciprocal_square_root(a, work, out, d, order, m):
 
 @njit(cache=True, error_model="numpy")
 def logarithm(a, work, out, d, order, m):
-    """``out = log(a)`` for ``a > 0``, charged four units of ``|log(a)| + 1`` more; ``work`` is [5, n] scratch."""
+    """Write ``out = log(a)`` for ``a > 0``, charged four units of ``|log(a)| + 1`` more; ``work`` is [5, n] scratch."""
     for q in range(out.shape[1]):
         c, (low, high, inside) = a[0, q], _ends(a, m, q)
         inverse = 1.0 / c if inside else 1.0

@@ -271,7 +271,7 @@ class KernelStore:
                 _log.info(self._progress.line(self.functions - self._before))
 
     def close(self) -> None:
-        """Publish, and remove the session's folder unless it is another process'."""
+        """Publish this session's kernels, and remove its folder unless another process owns it."""
         if self.shared:
             return
         with suppress(OSError):

@@ -60,7 +60,7 @@ class WatchedFrame(SplatFrame):
         self.not_finite = self.crossed = 0
 
     def render(self, values: np.ndarray, tiles: np.ndarray | None = None) -> np.ndarray:
-        """See `SplatFrame.render`."""
+        """Return `SplatFrame.render`, recorded."""
         picture = super().render(values, tiles)
         self.not_finite += _not_finite(picture)
         return picture
@@ -69,7 +69,7 @@ class WatchedFrame(SplatFrame):
         self, box: ParameterBox, tiles: np.ndarray, within: VisibleContext | None = None, keep_linear: bool = False,
         pixels: np.ndarray | None = None,
     ) -> TileBounds:  # fmt: skip
-        """See `SplatFrame.bound`."""
+        """Return `SplatFrame.bound`, recorded."""
         tile_bounds = super().bound(box, tiles, within, keep_linear, pixels)
         self.not_finite += _not_finite(
             tile_bounds.lower, tile_bounds.upper, tile_bounds.slopes, *(tile_bounds.linear or ())
@@ -85,7 +85,7 @@ class WatchedFrame(SplatFrame):
         keep_linear: bool,
         pixels: np.ndarray | None,
     ) -> list[TileBounds]:
-        """See `SplatFrame.bound_parts`; one by one, since they are counted."""
+        """Return `SplatFrame.bound_parts`, one box at a time, since they are counted."""
         return [self.bound(box, tiles, within, keep_linear, pixels) for box in boxes]
 
 

@@ -335,7 +335,7 @@ def bench(options: Any) -> int:
 
 
 def main() -> None:
-    """Entry point of the console script."""
+    """Run the console script."""
     kinds = tyro.extras.subcommand_type_from_defaults(_DEFAULTS)
     run(bench, command("ns-abstract-bench", kinds, _DEFAULTS, _ABOUT))
 

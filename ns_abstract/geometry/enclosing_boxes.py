@@ -108,7 +108,7 @@ class EnclosingBoxes(Generic[_Value]):
         self._lock = threading.Lock()
 
     def around(self, cell: ParameterBox) -> _Value | None:
-        """Return the value of the box around a cell; None: the cell reaches beyond the set."""
+        """Return the cached value of the enclosing box of a cell; None: the cell reaches beyond the set."""
         box = box_of_motion(cell, self._whole, self._motion, _TUNING.shared_motion)
         if box is None:
             return None

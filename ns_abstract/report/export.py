@@ -188,10 +188,7 @@ def _figures(results: Results, result: FrameResult, names: Sequence[str]) -> str
 
 
 def write_video(results: Results, file: Path, names: Sequence[str], fps: float, labelled: bool = False) -> None:
-    """An H.264 video (mp4) of the pictures ``names`` side by side, one frame of the path after the other.
-
-    ``labelled``: as `panels`. Raises InputError: PyAV is missing.
-    """
+    """Write an H.264 video (mp4) of the pictures ``names`` side by side, one frame of the path after the other."""
     if not (math.isfinite(fps) and 0.1 <= fps <= 1000.0):
         raise InputError(f"found {fps}", field="--fps", fix="give a number from 0.1 to 1000")
     if not has_video():

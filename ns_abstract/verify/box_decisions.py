@@ -192,7 +192,7 @@ class _BoxSearch:
     # ------------------------------------------------------------ proofs
 
     def _bisect(self, shared: _SharedProperty) -> bool:
-        """Do `decide` by bisecting boxes."""
+        """Decide the property as `decide` does, by bisecting boxes of inputs."""
         waiting: list[_Box] = list(zip(range(len(shared.regions)), shared.lower, shared.upper, strict=True))
         most = _WAITING + len(waiting)
         while waiting:

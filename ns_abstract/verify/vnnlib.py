@@ -63,7 +63,7 @@ class _Run:
         return " ".join(f"{text})" for text in self.texts)
 
     def read(self, declared: set[str], size: _VariableCounts) -> None:
-        """Parse the texts into ``limits``."""
+        """Parse the texts of the constraints into ``limits`` of the variables."""
         for text in set(self.texts).difference(self.limits):
             ((constraint,),) = _disjunction(_expressions(text + ")")[0], declared, size)
             assert not isinstance(constraint, _Run)

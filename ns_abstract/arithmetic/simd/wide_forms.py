@@ -100,7 +100,7 @@ def _before(w, at, fresh):
 
 @njit(cache=True, error_model="numpy", forceinline=True)
 def _accumulate(w, a, b, sign, out, coefficient, fresh, m):
-    """``out = sign a b`` or, not ``fresh``, ``out += sign a b``, but for the rows that `set_norms` writes."""
+    """Write ``out = sign a b`` or, not ``fresh``, ``out += sign a b``, but for the rows that `set_norms` writes."""
     ca, cb = load8(w, a), load8(w, b)
     ra, rb = load8(w, a + 8 * m), load8(w, b + 8 * m)
     la, lb = load8(w, a + 8 * (m + 1)), load8(w, b + 8 * (m + 1))
@@ -122,7 +122,7 @@ def _accumulate(w, a, b, sign, out, coefficient, fresh, m):
 
 @njit(cache=True, error_model="numpy")
 def add_product(w, a, b, sign, out, m):
-    """``out += sign a b``, but for the rows of sums: `set_norms` must follow (design.md, A2)."""
+    """Write ``out += sign a b``, but for the rows of sums: `set_norms` must follow (design.md, A2)."""
     _accumulate(w, a, b, sign, out, ADDED_PRODUCT_ROUNDING, False, m)
 
 
@@ -135,7 +135,7 @@ def multiply(w, a, b, out, m):
 
 @njit(cache=True, error_model="numpy", forceinline=True)
 def _accumulate_square(w, a, out, coefficient, fresh, m):
-    """``out = a a`` or, not ``fresh``, ``out += a a``, but for the rows that `set_norms` writes."""
+    """Write ``out = a a`` or, not ``fresh``, ``out += a a``, but for the rows that `set_norms` writes."""
     c, r, l = load8(w, a), load8(w, a + 8 * m), load8(w, a + 8 * (m + 1))
     half = 0.5 * (l * l)
     p = abs(c) + l
@@ -148,7 +148,7 @@ def _accumulate_square(w, a, out, coefficient, fresh, m):
 
 @njit(cache=True, error_model="numpy")
 def add_square(w, a, out, m):
-    """``out += a a``, but for the rows of sums: `set_norms` must follow (design.md, A2)."""
+    """Write ``out += a a``, but for the rows of sums: `set_norms` must follow (design.md, A2)."""
     _accumulate_square(w, a, out, ADDED_PRODUCT_ROUNDING, False, m)
 
 

@@ -118,7 +118,7 @@ class NerfMethod(FieldMethod):
         return NerfFrame(self.scene, self.sampling, poses, self.device, self._processes(poses.geometry.box.dimensions))
 
     def weight_frame(self, poses: PoseBox, planes: Sequence[WeightPlane], pixels: np.ndarray) -> NerfWeightFrame:
-        """See `ns_abstract.refine.protocol.WeightMethod`: weights of samples in boxes, distances along the rays."""
+        """Return the frame of the weights of samples in boxes, or of distances along the rays."""
         workers = self._processes(poses.geometry.box.dimensions)
         return NerfWeightFrame(self.scene, self.sampling, poses, planes, pixels, self.device, workers)
 
@@ -130,7 +130,7 @@ class NerfMethod(FieldMethod):
         return processes_that_fit(device_bytes(field, basis_of(dimensions + swept, field)), self.workers)
 
     def memory(self, pixels: int, threads: int) -> int:
-        """See `Method.memory`; rays are bounded one after another."""
+        """Return the bytes that a frame needs; rays are bounded one after another."""
         weights = sum(array.nbytes for array in self.scene.fine.arrays())
         voxels = 0 if self.scene.occupancy is None else self.scene.occupancy.occupied.size
         return 8 * weights + VOXEL_BYTES * voxels + pixels * (400 + 4 * self.sampling.samples) + (1 << 30)
@@ -238,19 +238,19 @@ class NerfWeightFrame(NerfFrame):
         self._dimensions = pose_set.box.dimensions
 
     def of_sample(self, values: np.ndarray, sample: SceneSample | None) -> np.ndarray:
-        """See `ns_abstract.refine.protocol.WeightFrame`; 0 on rays that are not read."""
+        """Return the tiles of weights at a pose, of the stored scene or of ``sample``; 0 on rays that are not read."""
         tiles = np.zeros((self.tile_count, 1, 1, 3), np.float32)
         tiles[self.rays] = self.render(values[: self.box.dimensions], self.rays)
         return tiles
 
     def differentiable(self, values: torch.Tensor) -> torch.Tensor:
-        """See `ns_abstract.refine.protocol.WeightFrame`."""
+        """Return weights [H, W, 3] at parameter values [d], differentiable where samples are selected."""
         return self.renderer.picture(self.camera, differentiable_pose(self.pose_set)(values[: self.box.dimensions]))
 
     def cell_bounds(
         self, box: ParameterBox, weigh: Callable[[], np.ndarray | None] | None = None, most_rays: int | None = None
     ) -> Bounds:
-        """See `NerfFrame.cell_bounds`; rays that are not read have zeros."""
+        """Return linear bounds of all tiles over a cell; rays that are not read have zeros."""
         plain = super().cell_bounds(box.without(COLOR_SHIFTS), weigh, most_rays)
         assert plain.linear is not None
         d, more = self.box.dimensions, self._dimensions - self.box.dimensions

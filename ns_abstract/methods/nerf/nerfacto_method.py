@@ -84,7 +84,7 @@ class NerfactoMethod(FieldMethod):
         return NerfactoFrame(self.scene, poses, self.workers)
 
     def memory(self, pixels: int, threads: int) -> int:
-        """See `Method.memory`; rays are bounded one after another."""
+        """Return the bytes that a frame needs; rays are bounded one after another."""
         weights = sum(array.nbytes for array in self.scene.field.arrays())
         return 2 * weights + pixels * (400 + 4 * sum(self.scene.field.samples)) + (1 << 30)
 

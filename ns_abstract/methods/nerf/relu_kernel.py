@@ -93,7 +93,7 @@ def grid_of(basis: ChebyshevBasis) -> FitGrid:
 
 @njit(cache=True, error_model="numpy")
 def _multiply(matrix, order, lanes, out):
-    """``out = matrix @ lanes``, [R, LANES] of [R, K] and [K, LANES]; ``order``: see `FitGrid`."""
+    """Write ``out = matrix @ lanes``, [R, LANES] of [R, K] and [K, LANES]; ``order``: see `FitGrid`."""
     count, terms = matrix.shape
     factors, elements, results = pointer(matrix), pointer(lanes), pointer(out)
     places, line = pointer(order), LINE // lanes.itemsize
@@ -309,7 +309,7 @@ def _errors(values, fitted, above, below, least, most):
 
 @njit(cache=True, error_model="numpy")
 def _open(poly, rho, box, failed, grid, slope, size, which, neuron, error):
-    """Relax unstable neurons: slopes, sizes, polynomials and boxes in place; return the number of new error terms.
+    """Relax unstable ReLUs in place: new slopes, sizes, polynomials and boxes; return the number of new error terms.
 
     See `relu`; ``rho``: [B, n] sums of absolute columns, ``which``, ``neuron`` and ``error``: new error terms.
     """

@@ -103,7 +103,7 @@ def _directions(w, low, degree, m):
 
 @njit(cache=True, error_model="numpy", forceinline=True)
 def _scaled(w, a, s, shift, out, m):
-    """``out = s a + shift``."""
+    """Write ``out = s a + shift``."""
     scale_add(w, a, s, a, 0.0, shift, out, m)
 
 

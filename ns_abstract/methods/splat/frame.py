@@ -192,7 +192,7 @@ class SplatFrame(Frame):
         return box
 
     def warm_up_sub_boxes(self) -> None:
-        """See `ns_abstract.refine.protocol.SubBoxFrame`."""
+        """Compile the kernels that `sub_box_ends` needs besides the frame's own."""
         if self.box.dimensions > 1:
             forms = self.pose_set.enclosure(self._narrow, self.order)
             self.bounds.warm_up(self.camera, forms, shared_out(np.ones(self.box.dimensions), _TUNING.parts))
@@ -300,19 +300,19 @@ class SplatFrame(Frame):
         return lower, upper
 
     def motion_field(self, box: ParameterBox) -> MotionField:
-        """See `ns_abstract.refine.protocol.SubBoxFrame` (design.md, B16)."""
+        """Return the estimated motion of the picture's blocks over a cell of poses (design.md, B16)."""
         return MotionField(self._image_motion.of_squares(box), self._image_motion.side)
 
     def parallax(self, box: ParameterBox) -> np.ndarray:
-        """See `ns_abstract.refine.protocol.SubBoxFrame`."""
+        """Return pixels [d] by which typical Gaussians move over each parameter's range relative to their block."""
         return self._image_motion.parallax(box)
 
     def enclosing(self, box: ParameterBox) -> EnclosingContext | None:
-        """See `ns_abstract.refine.protocol.SubBoxFrame`."""
+        """Return the context of a wider cell around ``box``, for `bound`; None: there is none."""
         return self._enclosing.around(box)
 
     def element_counts(self, box: ParameterBox) -> np.ndarray:
-        """See `ns_abstract.refine.protocol.SubBoxFrame`."""
+        """Return the estimated number [H, W] of Gaussians that bounds of each pixel over a cell look at."""
         context = self.enclosing(box)
         return np.zeros((self.camera.height, self.camera.width), np.int64) if context is None else context.counts
 

@@ -103,11 +103,7 @@ class SplatMethod(Method):
         )  # fmt: skip
 
     def weight_frame(self, poses: PoseBox, planes: Sequence[WeightPlane], pixels: np.ndarray) -> SplatWeightFrame:
-        """See `ns_abstract.refine.protocol.WeightMethod`; tiles without a pixel to read cost nothing anyway.
-
-        Raises:
-            InputError: A selection picks no Gaussian.
-        """
+        """Return the frame of the weights of selected Gaussians; tiles without a pixel to read cost nothing."""
         masks = [plane_mask(self.scene, self.splats.opacity, plane) for plane in planes]
         varied = self.varied(poses.perturbation.scene)
         sums = self._sums[poses.perturbation.scene]

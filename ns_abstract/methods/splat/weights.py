@@ -160,7 +160,7 @@ class SplatWeightFrame(SplatFrame):
         return self.renderer.tiles(self.camera, rotation, position, tiles, weighted)
 
     def of_sample(self, values: np.ndarray, sample: SceneSample | None) -> np.ndarray:
-        """See `ns_abstract.refine.protocol.WeightFrame`."""
+        """Return the tiles of weights at a pose, of the stored scene or of ``sample``."""
         if sample is None:
             return self.render(values)
         assert isinstance(sample, SplatSample)
@@ -201,7 +201,7 @@ class SplatWeightFrame(SplatFrame):
         return bounds, outward(*part_ends(bounds.parts[pixels]))
 
     def differentiable(self, values: torch.Tensor) -> torch.Tensor:
-        """See `ns_abstract.refine.protocol.WeightFrame`, by the reference renderer."""
+        """Return weights [H, W, 3] at parameter values [d] by the reference renderer, differentiable in them."""
         import torch
 
         from ns_abstract.geometry.differentiable_pose import differentiable_pose

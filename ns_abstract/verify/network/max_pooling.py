@@ -91,7 +91,7 @@ class WindowInputs(NamedTuple):
         return self.reference.abs() + moves + self.lower.abs() + self.upper.abs()
 
     def relaxation_gap(self) -> Tensor:
-        """Return upper bounds [B, K, K] of input j minus input i: -1e300 if j is padding, else 1e300 if i is."""
+        """Return upper bounds [B, K, K] of input j minus i at (j, i): -1e300 if j is padding, else 1e300 if i is."""
 
         def less(v: Tensor) -> Tensor:
             return v[:, :, None] - v[:, None, :]

@@ -110,7 +110,7 @@ def spread_of(a):
 
 @njit(cache=True, error_model="numpy", **UNCOUNTED)
 def multiply(a, b, line, out):
-    """``out = a b`` (design.md, H1); ``out`` is neither of them."""
+    """Write ``out = a b`` (design.md, H1); ``out`` is neither of them."""
     k = a.shape[0] - 1
     spread_a, spread_b, shift, mixed = 0.0, 0.0, 0.0, 0.0
     for i in range(1, k):
@@ -134,7 +134,7 @@ def multiply(a, b, line, out):
 
 @njit(cache=True, error_model="numpy", **UNCOUNTED)
 def scale_add(a, factor, b, shift, out):
-    """``out = factor a + b + shift``; ``b`` may be ``out``."""
+    """Write ``out = factor a + b + shift``; ``b`` may be ``out``."""
     k = a.shape[0] - 1
     size = abs(shift)
     for i in range(k):
@@ -146,7 +146,7 @@ def scale_add(a, factor, b, shift, out):
 
 @njit(cache=True, error_model="numpy", **UNCOUNTED)
 def compose(a, derivatives, line, out, scratch):
-    """``out = f(a)`` by Taylor's formula of order 2 about the centre (design.md, A3).
+    """Write ``out = f(a)`` by Taylor's formula of order 2 about the centre (design.md, A3).
 
     ``derivatives`` are f, f', f'' / 2 at the centre, and a bound of ``|f'''| / 6`` over the range; ``line`` tells
     whether the pose symbols are those of one parameter; ``scratch`` is [2, n + 3].

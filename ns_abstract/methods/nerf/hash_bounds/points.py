@@ -116,7 +116,7 @@ def harmonics(direction, line, out, work):
 
 @njit(cache=True, error_model="numpy", **UNCOUNTED)
 def _negate(a, out):
-    """``out = -a``; it may be ``a`` itself."""
+    """Write ``out = -a``; it may be ``a`` itself."""
     for s in range(a.shape[0] - 1):
         out[s] = -a[s]
     out[-1] = a[-1]
