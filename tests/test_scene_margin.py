@@ -129,9 +129,9 @@ def test_a_resumed_command_settles_nothing_twice(tmp_path: Path) -> None:
 
         margins = Margins(cells(), lambda kind: counted, store)
         margins.find(Deadline(1e6, stop), [KIND])
-        assert margins.found[0].state == ("done" if stops == 1000 else "ended")
+        assert margins.results[0].state == ("done" if stops == 1000 else "ended")
         store.close()
-    (found,) = margins.found
+    (found,) = margins.results
     assert found.radius == whole.radius and found.example == whole.example
     assert [(t.cell, t.radius, t.outcome, t.parts) for t in found.trials] == [
         (t.cell, t.radius, t.outcome, t.parts) for t in whole.trials

@@ -326,7 +326,7 @@ class CellSearch(Generic[P]):
             store,
             engine,
             self.grids,
-            lambda *found: examine_here(question.examiner, *found),
+            lambda *block: examine_here(question.examiner, *block),
             (examine_block, question.examiner.recipe),
             deadline=deadline,
             stop=stop,

@@ -59,14 +59,14 @@ class Audit:
             return 1
         return 3 if self.proved < _ENOUGH * self.claims or not self.claims else 0
 
-    def _tally(self, found: list[ClaimOutcome]) -> None:
-        """Sets the counts of proved, refuted and unsettled claims from ``found``, the outcome of every claim."""
-        self.claims, self.proved = len(found), sum(o.verdict is True for o in found)
-        self.refuted, self.unsettled = (sum(o.verdict is v for o in found) for v in (False, None))
-        self.float32 = sum(o.verdict is True and o.float32 for o in found)
-        self.refutations = [o.found for o in found if o.verdict is False]
+    def _tally(self, outcomes: list[ClaimOutcome]) -> None:
+        """Sets the counts of proved, refuted and unsettled claims from ``outcomes``, the outcome of every claim."""
+        self.claims, self.proved = len(outcomes), sum(o.verdict is True for o in outcomes)
+        self.refuted, self.unsettled = (sum(o.verdict is v for o in outcomes) for v in (False, None))
+        self.float32 = sum(o.verdict is True and o.float32 for o in outcomes)
+        self.refutations = [o.refutation for o in outcomes if o.verdict is False]
         self.picture = "every float32 evaluation" if self.proved == self.float32 > 0 else "real numbers"
-        drawn = [o for o in found if o.uniform]
+        drawn = [o for o in outcomes if o.uniform]
         proved = [o for o in drawn if o.verdict is True]
         sure = sum(o.float32 for o in proved)
         self.uniform = {

@@ -42,14 +42,14 @@ class Margins:
         on_progress: Callable[[SceneMargin], object] = lambda margin: None,
     ) -> None:
         self.cells, self._prover, self._store, self._told = cells, prover, store, on_progress
-        self.found: list[SceneMargin] = []
+        self.results: list[SceneMargin] = []
 
     def find(self, deadline: Deadline, kinds: Sequence[VariationKind]) -> None:
         """Find the margins; the remaining time is divided equally among the remaining kinds."""
         for number, kind in enumerate(kinds if self.cells else ()):
             part = deadline.within(deadline.left / (len(kinds) - number))
-            self.found.append(largest_radius(kind, self.cells, self._remembered(kind), part))
-            self._told(self.found[-1])
+            self.results.append(largest_radius(kind, self.cells, self._remembered(kind), part))
+            self._told(self.results[-1])
 
     def _remembered(self, kind: VariationKind) -> ProveCell:
         """Returns a cell prover for variations of ``kind`` that reads outcomes from the store, and stores new ones."""
@@ -66,7 +66,7 @@ class Margins:
 
     def keep(self) -> None:
         """Write the files of scenes that falsify a certified cell."""
-        for margin in self.found:
+        for margin in self.results:
             if margin.example is not None:
                 buffer = io.BytesIO()
                 arrays: dict[str, Any] = dict(margin.example)
@@ -77,7 +77,7 @@ class Margins:
     def entry(self) -> dict[str, Any]:
         """Return the entry `scene_margin` of report.json."""
         skipped = None if self.cells else "nothing is certified"
-        return {"skipped": skipped, "kinds": [margin.entry for margin in self.found]}
+        return {"skipped": skipped, "kinds": [margin.entry for margin in self.results]}
 
 
 def certified_cells(

@@ -27,8 +27,8 @@ class ClaimOutcome(NamedTuple):
     float32: bool
     #: Whether it was drawn so.
     uniform: bool
-    #: What is wrong.
-    found: dict[str, Any]
+    #: Pose and excess of a refuted claim, else empty.
+    refutation: dict[str, Any]
 
 
 def open_result(folder: Path, moved: dict[str, Path | None]) -> tuple[list[str], list[Claims], list[int]]:

@@ -112,7 +112,7 @@ def _frame(
     poses: PoseBox,
     rows: Sequence[Row],
     possible: float,
-    found: Sequence[Any],
+    explaining: Sequence[Any],
 ) -> dict[str, Any]:
     box = poses.box
     entries = sides(box, parameters, poses.fixed)
@@ -131,11 +131,11 @@ def _frame(
             "upper": np.max([row["upper"] for row in left], axis=0),
         }
     best = None
-    if found:
-        values = dict(zip(box.names, found[0].values, strict=True))
+    if explaining:
+        values = dict(zip(box.names, explaining[0].values, strict=True))
         pose = [values.get(entry["name"], entry["lower"]) for entry in entries]
-        matrix = poses.pose(np.array(found[0].values))
-        best = {"pose": pose, "outliers": found[0].outliers, "camera_to_world": matrix}
+        matrix = poses.pose(np.array(explaining[0].values))
+        best = {"pose": pose, "outliers": explaining[0].outliers, "camera_to_world": matrix}
     return {
         "index": index,
         "intrinsics": poses.camera.intrinsics._asdict(),

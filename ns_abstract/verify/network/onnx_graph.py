@@ -397,15 +397,15 @@ class Attributes:
 
     def __init__(self, reader: OnnxReader, node: onnx.NodeProto) -> None:
         self.reader, self.node = reader, node
-        self.found = {a.name: a for a in node.attribute}
+        self.by_name = {a.name: a for a in node.attribute}
         self.asked: set[str] = set()
 
     def get(self, name: str, default: Any = None) -> Any:
         self.asked.add(name)
-        if name not in self.found:
+        if name not in self.by_name:
             # the format's attributes are float32 numbers, and so are its defaults
             return float(np.float32(default)) if isinstance(default, float) else default
-        value = onnx.helper.get_attribute_value(self.found[name])
+        value = onnx.helper.get_attribute_value(self.by_name[name])
         return value.decode() if isinstance(value, bytes) else value
 
     def ints(self, name: str, count: int, default: int | None = None) -> tuple[int, ...] | None:
@@ -427,7 +427,7 @@ class Attributes:
         self.asked.update(names)
 
     def done(self) -> None:
-        for name in self.found:
+        for name in self.by_name:
             if name not in self.asked:
                 raise InputError(f"attribute {name} is not supported", fix="export without it")
 
