@@ -8,6 +8,7 @@ import json
 import shutil
 import sqlite3
 import sys
+from collections.abc import Iterator
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -507,6 +508,52 @@ def test_a_forged_table_is_found(name: str, copy: Path, in_process: InProcess) -
     rewrite(copy, change)
     code, out, err = in_process(check_command.main, [str(copy), "--claims", "1"])
     assert code == expected and words in out + err and len(err.splitlines()) == (expected == 2)
+
+
+#: What of a certificate's report has no part in its claims (docs/check.md, "What is not checked").
+UNCHECKED = {
+    "assumptions", "cameras", "certified_of_sampled_right", "command", "effort", "guarantee_text", "limits", "metrics",
+    "network_guarantee", "packages", "partitions", "plan", "property_text", "sampled", "scene_margin", "seconds",
+    "started", "state", "trace", "unknown_because", "updated",
+    "frames.intrinsics", "frames.parameters.unit", "frames.partition", "frames.sampled", "frames.counterexamples",
+    "model.name", "model.bytes", "model.input", "scene.name", "scene.source", "scene.sh_degree", "scene.sh_degree_used",
+    "scene.units",
+}  # fmt: skip
+#: Its settings and fingerprint that have one: the inputs, and the scene's digest.
+CHECKED = {
+    "settings.translation", "settings.units", "settings.angle_units", "settings.load_config",
+    "settings.camera_path_filename", "settings.model", "fingerprint.scene",
+}  # fmt: skip
+
+
+def numbers_and_words(value: Any, place: tuple[Any, ...] = ()) -> Iterator[tuple[tuple[Any, ...], Any]]:
+    """Yield the places and values of all numbers and words of a document; of lists the first element's."""
+    if isinstance(value, (dict, list)):
+        for key, part in value.items() if isinstance(value, dict) else enumerate(value[:1]):
+            yield from numbers_and_words(part, (*place, key))
+    elif value is not None:
+        yield place, value
+
+
+@pytest.mark.slow
+def test_every_number_and_word_that_a_claim_rests_on_is_checked(copy: Path) -> None:
+    """A field that a later version adds has to be checked, or to be listed as unchecked."""
+    file = copy / "report.json"
+    document, accepted = json.loads(file.read_text()), []
+    for place, value in numbers_and_words(document):
+        name = ".".join(key for key in place if isinstance(key, str))
+        parts = {name.rsplit(".", k)[0] for k in range(name.count(".") + 1)}
+        if parts & UNCHECKED or (place[0] in ("settings", "fingerprint") and not parts & CHECKED):
+            continue
+        other = not value if isinstance(value, bool) else f"{value}x" if isinstance(value, str) else value + 1
+        file.write_text(json.dumps(changed(document, place, other)))
+        try:
+            found = check(copy, claims=2, seconds=20)
+        except nsa.InputError:
+            continue
+        if not found.exit_code:
+            accepted.append(name)
+    assert accepted == []
 
 
 def headlines(document: dict[str, Any]) -> dict[str, dict[str, Any]]:

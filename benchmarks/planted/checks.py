@@ -89,6 +89,14 @@ CHECKS = (
         f"{_KINDS}::test_frames_may_vary_less_than_others",
     ),
     Fault(
+        "checker: any word is a guarantee",
+        "check/audit.py",
+        "_open_parts",
+        'report.get("guarantee") not in ("float32-sound", "real-sound")',
+        "False",
+        f"{_KINDS}::test_every_number_and_word_that_a_claim_rests_on_is_checked",
+    ),
+    Fault(
         "checker: unknown keys of a set of poses are passed over",
         "check/inputs.py",
         "read_poses",
