@@ -299,8 +299,8 @@ ENTRIES = (
     ),
     Entry(
         "six", "Six parameters at once",
-        "The camera may be off by 0.002 units along every axis and by 0.1 degrees about every axis: bounds are wider "
-        "than with one parameter, because cells are many in six dimensions.",
+        "The camera may be off by 0.002 units along every axis and by 0.1 degrees about every axis. Bounds are wider "
+        "than with one parameter: six dimensions need many more cells, so in the same time each cell stays larger.",
         _SIX_COMMAND,
         "out/six", frame_picture("out/six"),
     ),

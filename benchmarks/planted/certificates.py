@@ -380,7 +380,7 @@ CERTIFICATES = (
     ),
     Fault(
         "VNN-LIB: the last bound of an input counts",
-        _VNNLIB, "_Run.limit", "np.minimum.at(ends[1], index[side == 1], value[side == 1])",
+        _VNNLIB, "_InputBounds.limit", "np.minimum.at(ends[1], index[side == 1], value[side == 1])",
         "ends[1].__setitem__(index[side == 1], value[side == 1])",
         "test_vnnlib_runner.py::test_runs_of_bounds_mean_what_single_ones_mean",
     ),

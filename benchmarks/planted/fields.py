@@ -174,16 +174,16 @@ FIELDS = (
     ),
     Fault(
         "compiled units: the line's error is a quarter of what it is",
-        _RELU, "_open", "line_error = (0.5 * line * -bottom + 4.0 * slack) * FIELD_UP",
+        _RELU, "_relax_unstable", "line_error = (0.5 * line * -bottom + 4.0 * slack) * FIELD_UP",
         "line_error = (0.25 * line * -bottom + 4.0 * slack) * FIELD_UP", _UNITS + "[1-True]",
     ),
     Fault(
         "compiled units: the fit is not shifted to its middle",
-        _RELU, "_open", "0.5 * (most[c] + least[c])", "0.0", _UNITS + "[1-True]",
+        _RELU, "_relax_unstable", "0.5 * (most[c] + least[c])", "0.0", _UNITS + "[1-True]",
     ),
     Fault(
         "compiled units: columns are halved without their error",
-        _RELU, "_open",
+        _RELU, "_relax_unstable",
         "(new + 0.5 * e + 2.0 * slack) * FIELD_UP", "(new + 2.0 * slack) * FIELD_UP",
         _UNITS + "[1-True]",
     ),

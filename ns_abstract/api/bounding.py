@@ -219,7 +219,7 @@ class _FrameSchedule:
                 self.job.check_time(self.frames[0], budget)
 
     def offer(self, room: int) -> Iterator[Task]:
-        """Yield tasks: no more than can be worked on, so that later ones know how much time is left."""
+        """Yield up to ``room`` tasks, no more than can be worked on, so that later ones know how much time is left."""
         threads = self.engine.threads
         while self._queue and self._flying < threads:
             left = self.deadline.left

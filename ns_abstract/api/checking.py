@@ -148,7 +148,7 @@ def check(
 
 
 def least_part(proved: int, count: int, level: float = 0.95) -> float:
-    """Return Clopper and Pearson's lower limit of the part of all claims that holds: ``proved`` of ``count`` do."""
+    """Return Clopper and Pearson's lower limit, at ``level``, of the part that holds: ``proved`` of ``count`` do."""
     low, high = 0.0, float(proved > 0)
     for _ in range(60):
         p = 0.5 * (low + high)

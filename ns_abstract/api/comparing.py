@@ -207,7 +207,7 @@ def _check_comparable(scene: Scene, other: Scene, pose_sets: Sequence[PoseBox]) 
 
 
 def _same_frame(first: DataparserTransform, second: DataparserTransform) -> bool:
-    """Whether two runs scale, turn and shift the data set equally up to the tolerance `_TUNING.same_frame`."""
+    """Return whether two runs scale, turn and shift the data set equally, up to `_TUNING.same_frame`."""
     turns, shifts = zip(*((f.matrix[:, :3] * f.scale, f.matrix[:, 3] * f.scale) for f in (first, second)), strict=True)
     # of a data set far from its origin the shift is long beside rotation and scale, which have a tolerance of their own
     sizes = first.scale, float(np.abs(turns[0]).max()), max(first.scale, float(np.abs(shifts[0]).max()))

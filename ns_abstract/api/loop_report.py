@@ -84,7 +84,7 @@ class LoopReport:
                 return
 
     def show_tubes(self, store: Store, deadline: Deadline) -> None:
-        """Draw the tubes of a few certified cells beside simulated runs and tubes with less dependence."""
+        """Add tubes of a few certified cells to the report, beside simulated runs and the widths of simpler tubes."""
         certified = [row for number in self.job.questions for row in store.leaves(number, "certified")]
         if not certified:
             return

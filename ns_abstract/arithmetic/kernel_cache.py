@@ -126,7 +126,7 @@ class KernelStore:
         self._entries = _read_manifest(folder) | self._entries
 
     def fetch(self, place: str, stamp: str) -> str:
-        """Return the session's folder for a module, with the cached files of its functions, but no damaged ones."""
+        """Return the session's folder for module ``place``, with those of its cached files that are not damaged."""
         folder = self.session / place
         if not folder.exists():
             with _locked(self.session / "lock"):
@@ -176,7 +176,7 @@ class KernelStore:
             save()
 
     def _link(self, place: str, stamp: str) -> None:
-        """Link the cached files of a module's functions into the session's folder."""
+        """Link the cached files of module ``place``, of source ``stamp``, into the session's folder."""
         folder = self.session / place
         for name, wanted in self._entries.items():
             if name.rpartition("/")[0] != place or (folder / f"{name.rpartition('/')[2]}.nbi").exists():

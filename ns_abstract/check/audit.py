@@ -48,7 +48,7 @@ def open_result(folder: Path, moved: dict[str, Path | None]) -> tuple[list[str],
 
 
 def _overall(report: dict[str, Any], parts: list[StoredCells], frames: Collection[int] | None = None) -> list[str]:
-    """Return contradictions of the report's overall verdict and coverage to its cells and the ``frames`` asked for."""
+    """Return contradictions of the report's verdict and coverage to the cells, ``parts``, and the frames asked for."""
     entries, kinds = entries_of(report), {c.index: {v[0] for v in c.verdicts or ()} for c in parts}
     wrong = [f"frame {k}: no cells" for k, e in entries.items() if k not in kinds and e["certified"] + e["falsified"]]
     for kind, said in (report.get("coverage") or {}).items():

@@ -17,7 +17,7 @@ LONGEST = 96
 
 
 def gathered(part: Any, row: Array, index: Array) -> Any:
-    """Return the elements at rows [W, 1] and columns ``index`` [W, m] of arrays or forms [..., B, n], or of a list."""
+    """Return the elements of ``part`` (an array, a form [..., B, n], or a list) at rows [W, 1] and columns [W, m]."""
     if isinstance(part, Affine):
         return part.apply(lambda a: a[..., row, index])
     if isinstance(part, np.ndarray):

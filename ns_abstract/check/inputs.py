@@ -105,7 +105,7 @@ def reading(file: Any, problem: str, fix: str | None = None) -> Iterator[None]:
 
 
 def read_json(file: Path, what: str, fix: str | None = None) -> dict[str, Any]:
-    """Return the JSON object of a file."""
+    """Return the JSON object of a file; ``what``: what messages call the file."""
     with reading(file, f"this {what} cannot be read", fix):
         if not file.is_file():
             raise BadInput(f"no such {what}", file, fix=fix)

@@ -302,7 +302,7 @@ def _surely_in_tile(p: ProjectedForms, ellipses: bool) -> tuple[Array, Array]:
 
 
 def _colors(splats: ActivatedScene, view: CameraForms, at: Array, depth: Affine, unit: float) -> Affine:
-    """Return the Gaussians' colours [3, B, n] seen from the cameras."""
+    """Return the colours [3, B, n] of the Gaussians numbered ``at``, seen from the cameras."""
     sh = np.moveaxis(splats.sh[at], (-2, -1), (0, 1))
     flat = depth.apply(lambda a: np.repeat(a[..., None, :, :], 3, axis=-3))
     if isinstance(splats.paint, float):

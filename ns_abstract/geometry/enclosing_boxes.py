@@ -108,7 +108,7 @@ class EnclosingBoxes(Generic[_Value]):
         self._lock = threading.Lock()
 
     def around(self, cell: ParameterBox) -> _Value | None:
-        """Return the cached value of the enclosing box of a cell; None: the cell reaches beyond the set."""
+        """Return the value of the box around ``cell``, cached by box; None: that box would reach beyond the set."""
         box = box_of_motion(cell, self._whole, self._motion, _TUNING.shared_motion)
         if box is None:
             return None
@@ -152,7 +152,7 @@ def _aligned(cell: ParameterBox, whole: ParameterBox, levels: Sequence[int]) -> 
 
 
 def _useful(box: ParameterBox, cell: ParameterBox, whole: ParameterBox, motion: np.ndarray) -> ParameterBox | None:
-    """Return ``box`` if it is not the cell and the picture moves by at most `EnclosingTuning.motion`, else None."""
+    """Return ``box`` if it is not the cell and moves the picture by at most `EnclosingTuning.motion`, else None."""
     widths = zip(box.lower, box.upper, whole.lower, whole.upper, motion.tolist(), strict=True)
     moved = [
         pixels * (past - first) / (high - low) if high > low else pixels for first, past, low, high, pixels in widths

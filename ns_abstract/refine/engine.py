@@ -105,7 +105,7 @@ class Refinement:
         return TracePoint(seconds, self.cells, self.leaves.mean_gap, self.inner.mean_gap)
 
     def _record(self, share: float, keep: bool = True) -> TracePoint:
-        """Report the present state; ``share`` of the set is covered."""
+        """Report the present state, in which ``share`` of the set is covered; ``keep``: whether the trace keeps it."""
         point = replace(self.point(), covered=share)
         if keep:
             self.trace.append(point)
@@ -184,7 +184,7 @@ class Refinement:
     def _bound(
         self, cells: list[LeafCell], parent: LeafCell | None, places: np.ndarray, pixels: np.ndarray | None = None
     ) -> list[tuple[np.ndarray, np.ndarray, Bounds]]:
-        """Return usable lower and upper bounds [t, side, side, channels] of each cell, and the frame's `Bounds`."""
+        """Return usable bounds [t, side, side, channels] of each cell in tiles ``places``, and the frame's `Bounds`."""
         bounds = self.tiles.bound(cells, parent, places, pixels)
         return [self._take(*both) for both in zip(cells, bounds, strict=True)]
 

@@ -51,7 +51,7 @@ class InnerBound:
         self.tiles.frame.observe(self.tiles.numbers(None), self.lower, self.upper)
 
     def render(self, values: np.ndarray, places: np.ndarray | None = None) -> np.ndarray:
-        """Render the pose at ``values``, and some other scenes there; return the picture of the frame's own scene."""
+        """Render the pose at ``values``, and some other scenes there; return the picture of the tiles ``places``."""
         begin = time.perf_counter()
         picture = self.tiles.render(self.tiles.frame.render, values, places)
         if places is None:
@@ -81,7 +81,7 @@ class InnerBound:
                 break
 
     def render_children(self, parent: LeafCell, children: Sequence[LeafCell], places: np.ndarray) -> None:
-        """Render poses in the parts of a split cell."""
+        """Render sample poses in the parts of a split cell, in the tiles ``places``, and widen the inner bound."""
         if parent.box.dimensions > 1:
             if children:
                 # one of them: the first corners have shown most of what there is to see

@@ -140,7 +140,7 @@ class LeafBounds:
         self._tighten(places)
 
     def _tighten(self, places: np.ndarray) -> None:
-        """Make the outer bound of tiles usable, and intersect it with the earlier one."""
+        """Make the outer bound of the tiles ``places`` usable, and intersect it with the earlier one."""
         self._intersect(places)
         self.lower[places], self.upper[places] = usable(self.lower[places], self.upper[places])
         self._mean_gap = None
@@ -167,7 +167,7 @@ class LeafBounds:
         self.update(np.array(sorted(changes), np.int64))
 
     def _intersect(self, places: np.ndarray) -> None:
-        """Intersect the outer bound of tiles with the earlier one: both hold (docs/dev/design.md, R5)."""
+        """Intersect the outer bound of the tiles ``places`` with the earlier one: both hold (design.md, R5)."""
         if self.earlier is not None:
             lower, upper = self.earlier
             low, high = self.lower[..., :COLORS], self.upper[..., :COLORS]

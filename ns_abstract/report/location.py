@@ -236,7 +236,7 @@ def pair_svg(entry: Mapping[str, Any], rows: Sequence[Row]) -> Markup | None:
 def _touched(
     ends: NDArray[np.float64], possible: NDArray[np.bool_], window: NDArray[np.float64], best: Any
 ) -> NDArray[np.uint8]:
-    """Return a picture [bins, bins, 3] of the bins of two parameters that boxes [n, 2, 2] touch; the second is up."""
+    """Return a picture [bins, bins, 3] of the bins, of two parameters, that boxes with ``ends`` [n, 2, 2] touch."""
     low, width = window[0], np.maximum(window[1] - window[0], np.finfo(np.float64).tiny)
     first = np.clip(np.floor((ends[:, 0] - low) / width * _BINS), 0, _BINS - 1).astype(int)
     last = np.clip(np.ceil((ends[:, 1] - low) / width * _BINS), 1, _BINS).astype(int)

@@ -53,7 +53,7 @@ def bin_ends(low: float, high: float, bins: int) -> Float64:
 
 
 def overlaps(lower: Float64, upper: Float64, ends: Float64) -> Float64:
-    """Return the fraction [n, bins] of every bin that intervals [n] to [n] cover."""
+    """Return the fraction [n, bins] of every bin, between ``ends``, that intervals [n] to [n] cover."""
     shared = np.minimum(upper[:, None], ends[1:]) - np.maximum(lower[:, None], ends[:-1])
     return np.maximum(shared, 0.0) / (ends[1:] - ends[:-1])
 

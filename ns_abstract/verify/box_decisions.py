@@ -149,6 +149,12 @@ _Box = tuple[int, np.ndarray, np.ndarray]
 
 
 class _BoxSearch:
+    """Search for a counterexample of properties over boxes of inputs, by attacks, bounds, cuts and branching.
+
+    Methods that return a bool return True if they found a counterexample, which is stored; `undecided` is set where one
+    may remain. ``which`` numbers regions of a property.
+    """
+
     def __init__(
         self,
         network: Network,
@@ -192,7 +198,7 @@ class _BoxSearch:
     # ------------------------------------------------------------ proofs
 
     def _bisect(self, shared: _SharedProperty) -> bool:
-        """Decide the property as `decide` does, by bisecting boxes of inputs."""
+        """Return whether bisection of the regions finds a counterexample; sets `undecided` where it gives up."""
         waiting: list[_Box] = list(zip(range(len(shared.regions)), shared.lower, shared.upper, strict=True))
         most = _WAITING + len(waiting)
         while waiting:
@@ -213,7 +219,7 @@ class _BoxSearch:
         return False
 
     def _branch(self, shared: _SharedProperty, which: int) -> bool:
-        """Do `decide` for one region by cutting dominant inputs, then branching on activation phases (N16)."""
+        """Return whether cuts of inputs and branching on phases (N16) find a counterexample in region ``which``."""
         waiting = [(shared.lower[which], shared.upper[which], shared.unsafe.groups)]
         attacked = False
         while waiting:
@@ -279,7 +285,7 @@ class _BoxSearch:
     def _phase_tree(
         self, shared: _SharedProperty, which: int, images: ImageSets, steps: int, groups: Sequence[tuple[int, ...]]
     ) -> tuple[PhaseTree, list[tuple[int, ...]]]:
-        """Return a tree over bounds with ``steps`` for intermediate ones, and the groups that its root leaves open."""
+        """Return a tree of activation phases for region ``which``, and the groups that its root leaves open."""
         start = self.deadline.left
         cells = NetworkBounds(
             self.bounded, images, self.memory, self.arithmetic, 1, intermediate_steps=steps,
@@ -334,7 +340,7 @@ class _BoxSearch:
     def _value(
         self, shared: _SharedProperty, x: torch.Tensor, which: np.ndarray, group: Sequence[int] | None = None
     ) -> torch.Tensor:
-        """Return `_SharedProperty.value` for inputs."""
+        """Return how safe the outputs for inputs ``x`` in regions ``which`` are (`_SharedProperty.value`)."""
         return shared.value(self.network(x.reshape(-1, *self.network.input_shape)), which, group)
 
     def _attack(
@@ -385,7 +391,7 @@ class _BoxSearch:
         steps: int,
         group: Sequence[int] | None,
     ) -> bool:
-        """Return whether descent from inputs ``x`` of regions ``which``, with ``steps`` evaluations, is successful."""
+        """Return whether gradient descent from inputs ``x`` in regions ``which`` finds a counterexample."""
         lower, upper = ends
         size = 0.25
         for left in reversed(range(steps)):
@@ -414,7 +420,7 @@ class _BoxSearch:
             return self._confirm(shared, tried, regions, self._value(shared, tried, regions))
 
     def _confirm(self, shared: _SharedProperty, x: torch.Tensor, which: np.ndarray, value: torch.Tensor) -> bool:
-        """Return whether one of the inputs with unsafe values is unsafe in the runtime, too."""
+        """Return whether the runtime, too, finds one of the inputs unsafe; ``which``: the numbers of their regions."""
         order = torch.argsort(value)[:2].tolist()
         for k in order:
             if not float(value[k]) <= _TUNING.nearly_unsafe * (1.0 + abs(float(value[k]))):

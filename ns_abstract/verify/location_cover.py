@@ -161,7 +161,7 @@ def cover(
 
 
 def _hull_volume(grid: CellGrid, boxes: ShearedBoxes, parts: list[Cell], chosen: np.ndarray) -> float:
-    """Return the volume of the hulls of the boxes' parts in each of the cells."""
+    """Return the summed volume of the hulls of the boxes ``chosen`` in each of the cells ``parts``; inf for one."""
     if len(parts) == 1:
         return np.inf
     total = 0.0

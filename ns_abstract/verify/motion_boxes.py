@@ -49,9 +49,9 @@ class MotionBoxes:
 
 @njit(cache=True, error_model="numpy", nogil=True)
 def _excluded(kept, motion, middles, half, out):
-    """Set ``out`` [n, k]: whether every motion cell that box ``middles`` [k, d] +- ``half`` meets is excluded.
+    """Set ``out`` [n, k]: whether all motion cells that box ``middles`` [k, d] +- ``half`` meets are excluded.
 
-    The rounding of ends is far below the overlap of the cells.
+    ``kept``: the motion cells that are not. The rounding of ends is far below the overlap of the cells.
     """
     rows, columns, d = kept.shape[1] - 1, kept.shape[2] - 1, half.size
     for pixel in range(out.shape[0]):

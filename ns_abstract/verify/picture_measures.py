@@ -105,7 +105,7 @@ class Measure:
         return torch.topk(pixels, self.rank, dim=1, largest=not self.least).values[:, -1]
 
     def bounds(self, planes: PlaneSets, first: int, parts: CellParts) -> tuple[np.ndarray, np.ndarray]:
-        """Return lower and upper bounds [s] of the value over each part of the cell."""
+        """Return lower and upper bounds [s] of the value over each part of the cell; ``first``: its first channel."""
         low, high = self._statistic_bounds(planes, first, parts, self.pixels)
         if self.minus is not None:
             taken = self._statistic_bounds(planes, first, parts, self.minus)
@@ -134,7 +134,7 @@ class Measure:
     def _mean_bounds(
         self, planes: PlaneSets, first: int, parts: CellParts, regions: list[tuple[np.ndarray, float]]
     ) -> tuple[np.ndarray, np.ndarray]:
-        """Return bounds [s] of a signed sum of means by linear bounds alone."""
+        """Return bounds [s] of a signed sum of means by linear bounds alone; ``first``: its first channel."""
         channels, ends = np.array(self.channels), []
         for sign in (1.0, -1.0):
             slope, value, size, count = np.zeros(parts.dimensions), 0.0, 0.0, 0

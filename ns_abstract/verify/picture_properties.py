@@ -122,7 +122,7 @@ def _sentence(statement: Statement, inner: bool = False) -> str:
 
 
 def _joined(statement: Statement, margins: Iterator[Any], least: Callable[..., Any], most: Callable[..., Any]) -> Any:
-    """Return the margin of a statement from the margins of its leaves, in order."""
+    """Return a statement's margin from its leaves' margins, in order: ``least`` of them for all, ``most`` for any."""
     if isinstance(statement, Leaf):
         return next(margins)
     parts = [_joined(part, margins, least, most) for part in statement.parts]

@@ -202,7 +202,7 @@ def typical_cell(
 def _bounds_in_the_middle(
     frame: Frame, cell: ParameterBox, parts: MotionCells | np.ndarray | None, pixels: np.ndarray
 ) -> list[tuple[np.ndarray, np.ndarray]]:
-    """Return by kind bounds [n, 3] of the ``n`` ``pixels`` over the middle of a cell."""
+    """Return by kind bounds [n, 3] of the ``n`` ``pixels`` over the middle of a cell, cut into ``parts``."""
     tiles = np.flatnonzero(pixels.any(axis=(1, 2)))
     if parts is None:
         whole = frame.bound(cell, tiles, None)

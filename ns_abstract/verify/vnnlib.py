@@ -50,7 +50,7 @@ _Linear = tuple[dict[int, float], float]
 
 
 @dataclass(frozen=True)
-class _Run:
+class _InputBounds:
     """A conjunction of bounds of single inputs: one text each, without the closing bracket.
 
     ``limits``, shared by all runs: by text, the side (0 below, 1 above), the input and the limit.
@@ -63,10 +63,10 @@ class _Run:
         return " ".join(f"{text})" for text in self.texts)
 
     def read(self, declared: set[str], size: _VariableCounts) -> None:
-        """Parse the texts of the constraints into ``limits`` of the variables."""
+        """Parse the bounds in ``texts`` that are not in ``limits`` yet, and add them there."""
         for text in set(self.texts).difference(self.limits):
             ((constraint,),) = _disjunction(_expressions(text + ")")[0], declared, size)
-            assert not isinstance(constraint, _Run)
+            assert not isinstance(constraint, _InputBounds)
             ends = np.array([[-np.inf], [np.inf]]) * np.ones(size.inputs or 0)
             _bound(constraint, ends)
             ((side, index),) = np.argwhere(np.isfinite(ends))
@@ -80,7 +80,7 @@ class _Run:
 
 
 #: ``rows @ y + offset <= 0`` for all rows of a list: one way to be unsafe.
-_Conjunction = list[_Linear | _Run]
+_Conjunction = list[_Linear | _InputBounds]
 
 
 class _VariableCounts(NamedTuple):
@@ -117,7 +117,7 @@ def _read(
 ) -> tuple[list[Any], Vnnlib2Query | None]:
     """Return a file's expressions as those of version 1, and the query of a file of version 2, or None.
 
-    ``runs``: whether bounds of single inputs may be a `_Run`.
+    ``runs``: whether bounds of single inputs may be a `_InputBounds`.
     """
     if not is_version_2(text):
         return _expressions(text, runs), None
@@ -200,9 +200,9 @@ def _regions(expressions: list[Any], sizes: _VariableCounts) -> tuple[InputRegio
     return tuple(regions)
 
 
-def _bound(constraint: _Linear | _Run, ends: np.ndarray) -> bool:
+def _bound(constraint: _Linear | _InputBounds, ends: np.ndarray) -> bool:
     """Narrow ``ends`` [2, n] and return True if ``constraint`` bounds one input; InputError: it joins several."""
-    if isinstance(constraint, _Run):
+    if isinstance(constraint, _InputBounds):
         constraint.limit(ends)
         return True
     coefficients, constant = constraint
@@ -237,7 +237,7 @@ def _declares(expression: Any, declared: set[str]) -> bool:
 
 
 def _expressions(text: str, runs: bool = False) -> list[Any]:
-    """Return nested lists of tokens; with ``runs`` also `_Run` inside of conjunctions."""
+    """Return nested lists of tokens; with ``runs`` also `_InputBounds` inside of conjunctions."""
     stack: list[list[Any]] = [[]]
     places: dict[str, tuple[int, int, float]] = {}
     at, number = 0, 0
@@ -248,7 +248,7 @@ def _expressions(text: str, runs: bool = False) -> list[Any]:
         run = _RUN.match(text, at) if runs and stack[-1][:1] == ["and"] else None
         if run:
             check_cancelled()
-            stack[-1].append(_Run([part.strip() for part in run[0].split(")")[:-1]], places))
+            stack[-1].append(_InputBounds([part.strip() for part in run[0].split(")")[:-1]], places))
             at = run.end()
             continue
         match = _TOKEN.match(text, at)
@@ -305,7 +305,7 @@ def _unsafe(conjunctions: list[_Conjunction], output_size: int, inputs: int) -> 
     for conjunction in conjunctions:
         group = []
         for constraint in conjunction:
-            assert not isinstance(constraint, _Run)
+            assert not isinstance(constraint, _InputBounds)
             coefficients, constant = constraint
             key = (tuple(sorted(coefficients.items())), constant)
             if key not in group_numbers:
@@ -360,9 +360,11 @@ def _disjunction(expression: Any, declared: set[str], size: _VariableCounts) -> 
         check_cancelled()
         ways: list[_Conjunction] = [[]]
         for part in expression[1:]:
-            if isinstance(part, _Run):
+            if isinstance(part, _InputBounds):
                 part.read(declared, size)
-            more: list[_Conjunction] = [[part]] if isinstance(part, _Run) else _disjunction(part, declared, size)
+            more: list[_Conjunction] = (
+                [[part]] if isinstance(part, _InputBounds) else _disjunction(part, declared, size)
+            )
             if len(more) == 1:
                 for way in ways:
                     way += more[0]

@@ -143,7 +143,7 @@ class RayCells:
         return self.ray.size
 
     def take(self, which: np.ndarray | slice) -> RayCells:
-        """Return some of the cells."""
+        """Return the cells numbered ``which``."""
         parts: list[Any] = [None if part is None else part[which] for part in vars(self).values()]
         return RayCells(*parts)
 

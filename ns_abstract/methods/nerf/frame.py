@@ -327,7 +327,7 @@ class FieldFrame(Frame):
         return Bounds(lower.reshape(shape), upper.reshape(shape), slopes, None, sets)
 
     def _every(self, part: np.ndarray) -> np.ndarray:
-        """Return bounds of all rays from those of `rays`."""
+        """Return bounds of all rays from those, ``part``, of the rays in `rays`."""
         whole = np.zeros((self.tile_count, *part.shape[1:]), part.dtype)
         whole[self.rays] = part
         return whole

@@ -137,7 +137,7 @@ class NerfactoRenderer(RayRenderer):
         return self.distances(places)
 
     def distances(self, places: Tensor) -> Tensor:
-        """Return distances of positions in [0, 1] along a ray (ray_samplers.py:113-118, 244-245)."""
+        """Return distances along a ray of ``places`` in [0, 1] (ray_samplers.py:113-118, 244-245)."""
         f, piecewise = self.field, self.field.spacing == "piecewise"
         near, far = (spacing(end) if piecewise else end for end in (f.near, f.far))
         places = places * far + (1.0 - places) * near

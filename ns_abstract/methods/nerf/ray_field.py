@@ -117,7 +117,7 @@ class RayRequest:
     shifts: list[Shifts]
 
     def take(self, which: np.ndarray) -> RayRequest:
-        """Return the request for some of the rays."""
+        """Return the request for the rays numbered ``which``."""
         most_alpha = None if self.most_alpha is None else self.most_alpha[which]
         aim = None if self.aim is None else (self.aim[0][which], self.aim[1][which])
         return replace(self, pixels=self.pixels[which], most_alpha=most_alpha, aim=aim)

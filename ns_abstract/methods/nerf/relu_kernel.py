@@ -146,7 +146,7 @@ def _on_grid(even, odd, grid, values):
 
 @njit(cache=True, error_model="numpy")
 def _gather(poly, which, neuron, even, odd):
-    """Copy coefficients of up to LANES neurons to ``even`` and ``odd``; spare lanes are 0."""
+    """Copy the coefficients of neurons ``neuron`` of pieces ``which`` to ``even`` and ``odd``; spare lanes are 0."""
     (_, m, n), flat, places = poly.shape, poly.reshape(-1), np.empty(LANES, np.int64)
     for c in range(which.shape[0]):
         places[c] = which[c] * m * n + neuron[c]
@@ -175,7 +175,7 @@ def _absolute(even, odd, out):
 def _certain(poly, rho, box, failed, slope, size, which, neuron):
     """Find the signs that the sums of coefficients decide; return the number of the others (``which``, ``neuron``).
 
-    See `_open` for the arguments; ``size`` is that of an active neuron where the sign is open.
+    See `_relax_unstable` for the arguments; ``size`` is that of an active neuron where the sign is open.
     """
     pieces, m, n = poly.shape
     spread = np.empty(n)
@@ -308,10 +308,11 @@ def _errors(values, fitted, above, below, least, most):
 
 
 @njit(cache=True, error_model="numpy")
-def _open(poly, rho, box, failed, grid, slope, size, which, neuron, error):
-    """Relax unstable ReLUs in place: new slopes, sizes, polynomials and boxes; return the number of new error terms.
+def _relax_unstable(poly, rho, box, failed, grid, slope, size, which, neuron, error):
+    """Relax the unstable neurons of a layer in place, and return the number of new error terms.
 
-    See `relu`; ``rho``: [B, n] sums of absolute columns, ``which``, ``neuron`` and ``error``: new error terms.
+    Args as for `relu`, besides: rho: [B, n] each neuron's sum of absolute error coefficients. which, neuron, error:
+    piece, neuron and radius of each new error term; overwritten.
     """
     undecided = _certain(poly, rho, box, failed, slope, size, which, neuron)
     lows, highs = np.empty(undecided), np.empty(undecided)
@@ -375,7 +376,7 @@ def relu(z, grid, limit, out):
     slope, size, spread, failed, count, piece, neuron, error = out
     pieces, n = sums.shape
     rho = sums * FIELD_UP
-    new_terms = _open(poly, rho, box, old_failed, grid, slope, size, piece, neuron, error)
+    new_terms = _relax_unstable(poly, rho, box, old_failed, grid, slope, size, piece, neuron, error)
     for b in range(pieces):
         count[b] = old_count[b]
         for j in range(n):

@@ -141,7 +141,7 @@ class SampleCellBounds:
         return self._levels[level]
 
     def _rows(self, level: int, items: RayCells) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Return index arrays, by sample, ray and part, of the parts [k, parts of a cell] of the cells ``items``."""
+        """Return index arrays (sample, ray, part) of the parts [k, parts of a cell] in the cells ``items``."""
         return items.sample[:, None], items.ray[:, None], self._level(level)[2][items.cell]
 
     def _bound_block(self, block: np.ndarray) -> None:
@@ -318,7 +318,7 @@ class SampleCellBounds:
     def _bound_field(
         self, level: int, items: RayCells, lines: np.ndarray, radius: np.ndarray, sure: np.ndarray, coarse: float
     ) -> tuple[np.ndarray, np.ndarray]:
-        """Return the first two masks of `_bound_batch`, by the network; if not ``sure`` [k], density may be 0, too."""
+        """Return the first two masks of `_bound_batch`, for cells ``items`` of a level, by the network's bounds."""
         device, field = self.owner.device, self.field
         monomials, bernstein, _ = self._level(level)
         self.cells += len(items)
@@ -365,7 +365,7 @@ class SampleCellBounds:
         return halve, lost
 
     def _leave_alike(self, level: int, items: RayCells, density: PreActivation) -> np.ndarray:
-        """Return [k] whether an opacity is negligible on the whole cell; if so, only its upper bound is stored."""
+        """Return [k] whether an item's opacity is negligible on its whole cell; then only its upper bound is stored."""
         length = torch.from_numpy(self.owner.lengths[items.sample]).to(density.poly.device)
         most = opacity(greatest(density)[:, 0], length, up=True)
         alike = ((most <= RAY_TUNING.alike * self.tolerance) & ~density.failed).cpu().numpy()
@@ -382,7 +382,7 @@ class SampleCellBounds:
         ``there`` [k, nodes, M] are the monomials at the cells' nodes.
         """
         if self.owner.white is not None:
-            self._whiten(self.owner.white, level, items)
+            self._bound_selected(self.owner.white, level, items)
             return
         device, field = self.owner.device, self.field
         bernstein = self._level(level)[1]
@@ -397,8 +397,11 @@ class SampleCellBounds:
         slack = torch.where(color.failed, 1.0, slack).cpu().numpy()
         self.vague[where] = np.minimum(self.vague[where], slack[:, None])
 
-    def _whiten(self, white: WhiteSamples, level: int, items: RayCells) -> None:
-        """Bound the colours of the cells ``items`` where selected samples are white and others black (Q3)."""
+    def _bound_selected(self, white: WhiteSamples, level: int, items: RayCells) -> None:
+        """Store bounds of the colours of cells ``items``, where selected samples are white and all others black (Q3).
+
+        A ray's colour is then the blending weight of what is selected. ``level``: the level of division of the cells.
+        """
         distance = self.owner.distances[items.sample]
         lines, radius = self.bundle.points(items.ray, distance, 0.5 * self.owner.lengths[items.sample])
         low, high = self.division.boxes(level)

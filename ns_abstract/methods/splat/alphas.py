@@ -109,7 +109,7 @@ def _form(record, number, antialiased):
 
 @njit(cache=True, error_model="numpy", forceinline=True)
 def _quadratic_alphas(record, begin, n, given, block, limits, charges, antialiased):
-    """Do `alphas` for one parameter and order 2."""
+    """Return `alphas` for one parameter and order 2."""
     batch, values = block.batch, block.fragments.values
     p0, p1, p2, pr = _form(record, 0, antialiased)
     c0, c1, c2, cr = _form(record, 1, antialiased)
@@ -329,7 +329,7 @@ def _set_curvature(alpha, rows, scratch, m):
 
 @njit(cache=True, error_model="numpy", forceinline=True)
 def _alphas_of_several(record, begin, n, given, block, limits, charges, antialiased, m):
-    """Do `alphas` for several parameters, or none, with curvature beside forms of order 1 (design.md, B10)."""
+    """Return `alphas` for several parameters, or none, with curvature beside forms of order 1 (design.md, B10)."""
     batch, rows, width = block.batch, block.batch.rows, block.fragments.width
     forms = _affine_forms(record, m, antialiased)
     drawn_lanes = 0
@@ -377,7 +377,7 @@ def _along_motion(rows, at, motion, r, size, inputs):
 
 @njit(cache=True, error_model="numpy", forceinline=True)
 def _alphas_over_parts(record, begin, n, given, block, limits, inputs):
-    """Do `alphas` for cells bounded over parts: bounds over all of the cell, and exponents (design.md, B12)."""
+    """Return `alphas` for cells bounded over parts: bounds over all of the cell, and exponents (design.md, B12)."""
     batch, rows, fragments = block.batch, block.batch.rows, block.fragments
     charges, half, m = inputs.charges, inputs.parts.half, inputs.shape.monomials
     forms = _affine_forms(record, m, inputs.rules.antialiased)

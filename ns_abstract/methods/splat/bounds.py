@@ -407,7 +407,7 @@ class SplatBounds:
         return forms
 
     def _cutoffs(self, floor: float, pairs: int) -> Cutoffs:
-        """Return the limits for fragments that get no more light than ``floor`` (design.md, B6, B8)."""
+        """Return the limits for fragments that get no more light than ``floor``; ``pairs``: see `Cutoffs` (B6, B8)."""
         stop, fade = self.rules.transmittance_min, 0.0
         if stop > 0.0 < floor:
             # each fragment that is drawn dims the light by the least alpha or more, and is added with one rounding

@@ -246,7 +246,7 @@ def keep_possible_stops(closed, last, past, count, parts, work, sums):
 def write_end(q, open_, charges, place, end, sums, out):
     """Write pixel q's ends with their charges to ``out`` [side, side, 6, parts] (design.md, B6, B8, B14).
 
-    ``open_``: the strips in which the background may be visible.
+    ``open_``: the strips in which the background may be visible. ``place``: the block of pixels.
     """
     side, levels = out.shape[0], sums.levels
     ends = out[place.y0 % side + q // BLOCK, place.x0 % side + q % BLOCK, end.row]

@@ -305,7 +305,7 @@ def _bound_block(numbers, goals, place, inputs, block, strips, color_ends, work,
 
 @njit(cache=True, error_model="numpy", nogil=True)
 def _depth_range_worker(share, lists, pixels, goals, inputs, strips, color_ends, out):
-    """Do one thread's tiles; see `ThreadShare` and `depth_range_stage`."""
+    """Bound the pixels of one thread's ``share`` of tiles; see `ThreadShare` and `depth_range_stage`."""
     sequence, counter = borrowed(share.sequence), pointer(share.counter)
     inputs = borrowed_inputs(inputs)
     strips = Strips(pointer(strips.middles), pointer(strips.half), strips.room)

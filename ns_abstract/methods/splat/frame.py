@@ -262,7 +262,7 @@ class SplatFrame(Frame):
         self, box: ParameterBox, tiles: np.ndarray, within: VisibleContext | None = None, keep_linear: bool = False,
         pixels: np.ndarray | None = None,
     ) -> TileBounds:  # fmt: skip
-        """See `ns_abstract.refine.protocol.Frame.bound`, and `bound_parts` for ``pixels``."""
+        """Return bounds of ``tiles`` over ``box``, reusing the context ``within``; with ``pixels``, of these alone."""
         return self._bound(box, tiles, within, self.candidates(tiles, within, pixels), keep_linear, pixels)
 
     def bound_parts(
@@ -276,7 +276,7 @@ class SplatFrame(Frame):
         self, box: ParameterBox, counts: np.ndarray | MotionCells, tiles: np.ndarray, pixels: np.ndarray,
         goals: np.ndarray, differences: np.ndarray,
     ) -> tuple[np.ndarray, np.ndarray] | None:  # fmt: skip
-        """See `ns_abstract.refine.protocol.SubBoxFrame` (design.md, U5, B14, B15)."""
+        """Return lower and upper bounds [n, 3, k] of n pixels over k sub-boxes, or None (design.md, U5, B14, B15)."""
         if box.dimensions < 2:
             return None
         check_cancelled()
@@ -337,7 +337,7 @@ class SplatFrame(Frame):
         self, box: ParameterBox, tiles: np.ndarray, within: VisibleContext | None, candidates: np.ndarray | None,
         keep_linear: bool, pixels: np.ndarray | None, sub_boxes: SubBoxes | None = None,
     ) -> TileBounds:  # fmt: skip
-        """Do `bound`, given the candidates; with ``sub_boxes`` also over these."""
+        """Return `bound`, given the candidates; with ``sub_boxes`` bounds over these, too."""
         check_cancelled()
         forms = self.pose_set.enclosure(box, self.order)
         layers = self.channels > COLORS

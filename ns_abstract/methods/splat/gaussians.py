@@ -249,7 +249,7 @@ def _project_block(candidates, block, inputs, scratch, out, state):
 
 @njit(cache=True, error_model="numpy")
 def _scatter_records(block, s, places, record):
-    """Write the records in the rows ``s`` to the rows of ``record`` that ``block`` names."""
+    """Write the records in rows ``s`` to the rows of ``record`` that ``block`` names; ``places`` is scratch."""
     last = block.shape[0] - 1
     for q in range(LANES):
         places[q] = block[min(q, last)]

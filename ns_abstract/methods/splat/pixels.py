@@ -146,7 +146,7 @@ def _tile_bounds(bounds, number, thread):
 
 @njit(cache=True, error_model="numpy", nogil=True)
 def _pixel_worker(share, lists, pixels, inputs, bounds):
-    """Do one thread's tiles; see `ThreadShare` and `pixel_stage`."""
+    """Bound the pixels of one thread's ``share`` of tiles; see `ThreadShare` and `pixel_stage`."""
     sequence, counter = borrowed(share.sequence), pointer(share.counter)
     inputs = borrowed_inputs(inputs)
     camera = inputs.intrinsics

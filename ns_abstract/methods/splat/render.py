@@ -300,7 +300,7 @@ def _blend_block(numbers, pixels, x0, y0, record, box, rules, state):
 
 @njit(cache=True, error_model="numpy", nogil=True)
 def _rasterise_worker(share, lists, sets_, record_, box_, camera, rules, background, image_):
-    """Composite one thread's tiles of ``lists.wanted`` into ``image_`` [t, side, side, 3], in [0, 1].
+    """Composite one thread's ``share`` of the tiles of ``lists.wanted`` into ``image_`` [t, side, side, 3], in [0, 1].
 
     ``sets_`` [t, blocks] int64 are the requested pixels of each block; the others show the ``background`` [3].
     ``record_`` and ``box_`` are those of `_Projected`.

@@ -169,7 +169,7 @@ class SplatWeightFrame(SplatFrame):
     def drawn_alone(
         self, context: VisibleContext, tiles: np.ndarray, pixels: np.ndarray
     ) -> Callable[[np.ndarray], np.ndarray]:
-        """See `ns_abstract.refine.protocol.ElementFrame`; one scene, the nearest."""
+        """Return a function that renders ``tiles`` from the Gaussians visible there alone; see `ElementFrame`."""
         some = self.candidates(tiles, context, pixels)
         assert some is not None
         some = np.sort(some)
@@ -194,7 +194,7 @@ class SplatWeightFrame(SplatFrame):
         self, box: ParameterBox, tiles: np.ndarray, within: VisibleContext, pixels: np.ndarray, counts: np.ndarray,
         levels: Sequence[float],
     ) -> tuple[TileBounds, tuple[np.ndarray, np.ndarray]]:  # fmt: skip
-        """See `ns_abstract.refine.protocol.ElementFrame` (design.md, B13)."""
+        """Return bounds of one box with linear bounds, and over its sub-boxes (design.md, B13); see `ElementFrame`."""
         candidates = self.candidates(tiles, within, pixels)
         bounds = self._bound(box, tiles, within, candidates, True, pixels, SubBoxes(counts, tuple(levels)))
         assert bounds.parts is not None

@@ -296,7 +296,7 @@ class NetworkBuilder:
         return self.gather(x, np.arange(int(np.prod(shape))).reshape(shape).transpose(order))
 
     def slice(self, x: int, chosen: Sequence[slice]) -> int:
-        """Add a slice of the item."""
+        """Add a slice of the item: the places ``chosen`` along its axes."""
         shape = self.shape(x)
         index = np.arange(int(np.prod(shape))).reshape(shape)[tuple(chosen)]
         if index.size == 0:

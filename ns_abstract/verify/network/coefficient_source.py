@@ -51,8 +51,8 @@ class CoefficientSource:
         return form, unstable, gaps
 
     def trace(self, count: int) -> BackwardTrace | None:
-        """Return memory for the coefficients of ``count`` rows that are to be stored, or None (N15)."""
+        """Return memory that receives the coefficients of ``count`` rows; None if they are not to be reused (N15)."""
         return None
 
     def keep(self, index: int, where: Int64, sign: Float64, trace: BackwardTrace) -> None:
-        """Store the coefficients of rows ``sign`` times single neurons of node ``index``."""
+        """Store coefficients for other cells: of rows ``sign`` times the neurons ``where`` of node ``index``."""

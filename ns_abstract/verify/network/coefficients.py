@@ -189,7 +189,7 @@ def _scale(value, y, x, factor):
 
 @njit(cache=True, error_model="numpy", nogil=True, inline="always")
 def _through_activation(coefficient, at, line, here, plane):
-    """Return the coefficient on an activation's input, and the constants that it adds below and above."""
+    """Return the coefficient on the input of activation ``at``, and the constants that it adds below and above."""
     a = coefficient[at]
     # all lines are read and one kept: signs are as good as random, and so several numbers go side by side
     s0, l0, m0 = line[here], line[here + plane], line[here + 2 * plane]

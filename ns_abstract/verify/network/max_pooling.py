@@ -117,7 +117,7 @@ class WindowPlanes(NamedTuple):
 
 
 def upper_planes(window: WindowInputs, apart: Tensor) -> WindowPlanes:
-    """Return for every window the candidate upper plane that is lowest in the middle (N12)."""
+    """Return for every window the upper plane that is lowest in the middle (N12), given the gaps ``apart``."""
     at = torch.arange(len(apart))
     winner = window.winner
     middle = torch.where(window.inside, window.reference + window.middle, torch.zeros_like(window.middle))

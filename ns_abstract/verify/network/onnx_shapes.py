@@ -176,7 +176,7 @@ def _slice(r: OnnxReader, node: onnx.NodeProto, a: Attributes) -> None:
 
 
 def _part(r: OnnxReader, node: onnx.NodeProto, x: TensorValue, chosen: Sequence[slice], output: int = 0) -> None:
-    """Set a node's output to a slice of an item."""
+    """Set a node's output to the slice ``chosen`` of an item."""
     if not x.batched:
         _gathered(r, node, x, _places(r, x)[tuple(chosen)], output)
         return

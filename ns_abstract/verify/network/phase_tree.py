@@ -282,7 +282,7 @@ class PhaseTree:
         return climbed
 
     def _candidates(self, chosen: OptimisedSlopes, at: Int64, phases: Sequence[Phases]) -> list[list[tuple[int, int]]]:
-        """Return by branch the unstable neurons whose relaxations cost row ``at`` most."""
+        """Return by branch the unstable neurons whose relaxations cost row ``at`` most, given its optimised slopes."""
         scores, nodes, places = [], [], []
         for k, own in self.relus.items():
             count = len(own.units.flat)

@@ -93,12 +93,12 @@ class RowAscent:
         return chosen, bounds
 
     def move(self, index: int, k: int, chosen: OptimisedSlopes, bounds: BackwardBounds, ascent: DualAscent) -> None:
-        """Take one optimisation step from the present slopes."""
+        """Take one optimisation step from the slopes in ``chosen``."""
         slopes, forces = self._derivatives(index, k, chosen, bounds, ascent)
         ascent.climb(slopes, forces, {at: self._size(chosen, at) for at in ascent.split})
 
     def _size(self, chosen: OptimisedSlopes, source: int) -> float:
-        """Return the typical magnitude of rows' coefficients at the readers of node ``source``."""
+        """Return the typical magnitude of the coefficients in ``chosen`` at the readers of node ``source``."""
         sizes = [
             float(np.abs(chosen.trace[k]).mean())
             for k, node in enumerate(self.network.nodes, 1)
@@ -109,7 +109,7 @@ class RowAscent:
     def _derivatives(
         self, index: int, cell: int, chosen: OptimisedSlopes, found: BackwardBounds, ascent: DualAscent
     ) -> tuple[dict[int, list[Float64]], dict[int, Float64]]:
-        """Return the derivatives of a cell's bounds by slopes and by multipliers, by node."""
+        """Return the derivatives of a cell's bounds by the slopes and multipliers in ``chosen``, by node."""
         planes, relaxations = self.intermediate.image, self.intermediate.relaxations[-1]
         on_image = chosen.trace.get(0)
         if on_image is None:

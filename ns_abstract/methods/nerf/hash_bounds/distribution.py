@@ -56,7 +56,7 @@ def _excess(light, count, k, share, line, out):
 
 @njit(cache=True, error_model="numpy", **UNCOUNTED)
 def _bin(light, k, line, out):
-    """Return weight plus padding of bin k: its form's pose symbols in ``out`` [n + 3], its rest, and bounds."""
+    """Return weight plus padding of bin k of a round: its form's symbols in ``out`` [n + 3], its rest, and bounds."""
     n = out.shape[0] - 3
     here, there = light.light[k], light.light[k + 1]
     out[0] = here[0] - there[0] + HISTOGRAM_PADDING
@@ -81,7 +81,7 @@ def _bin(light, k, line, out):
 
 @njit(cache=True, error_model="numpy", **UNCOUNTED)
 def _one_bin(light, count, edges, k, share, line, out, work):
-    """Compute the position of an edge that surely lies in bin k (design.md, H6)."""
+    """Compute the position of the edge at fraction ``share`` of the distribution, which surely lies in bin k (H6)."""
     n = out.shape[0] - 3
     value, weight = work[0], work[1]
     _excess(light, count, k, share, line, value)
@@ -153,7 +153,7 @@ def _slopes_of_bins(light, edges, first, past, line, work):
 
 @njit(cache=True, error_model="numpy", **UNCOUNTED)
 def _several_bins(light, count, edges, first, past, share, line, out, work):
-    """Compute the position of an edge in one of several bins, from a knot on by slopes of either side (H6)."""
+    """Compute the position of the edge at fraction ``share``, in several bins, by slopes of either side (H6)."""
     n = out.shape[0] - 3
     value, best = work[0], np.inf
     k = first + 1
@@ -223,7 +223,7 @@ def follow(light, count, edges, wanted, line, out, work):
 
 @njit(cache=True, error_model="numpy", **UNCOUNTED)
 def _within(light, count, edges, first, past, share, line, work):
-    """Return bounds of the position of an edge in the bins from ``first`` to ``past`` (exclusive)."""
+    """Return bounds of the position of the edge at fraction ``share`` in bins ``first`` to ``past`` (exclusive)."""
     low, _, _ = _excess(light, count, first, share, line, work[0])
     _, _, high_weight = _bin(light, first, line, work[1])
     part = min(max(low / high_weight, 0.0), 1.0)

@@ -130,7 +130,7 @@ def begin(light):
 
 @njit(cache=True, error_model="numpy", **UNCOUNTED)
 def _add_up(light, i, line, n):
-    """Compute the sum of depths and the transmittance behind interval ``i``."""
+    """Compute the sum of optical depths and the transmittance behind interval ``i``."""
     x, total, k = light.depth[i], light.total, i + 1
     for s in range(n + 1):
         total[k, s] = total[i, s] + x[s]
@@ -184,7 +184,7 @@ def _add_up(light, i, line, n):
 
 @njit(cache=True, error_model="numpy", **UNCOUNTED)
 def give_up(light, first, count):
-    """Leave the depths of the intervals from ``first`` on unknown."""
+    """Set the optical depths of the intervals from ``first`` on to unknown."""
     n = light.depth.shape[1] - 4
     for i in range(first, count):
         light.depth[i] = 0.0

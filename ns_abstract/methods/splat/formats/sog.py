@@ -178,7 +178,7 @@ class _Description:
         return _MODES[model], f"meta.json: model {model}"
 
     def _texels(self, section: str, place: int) -> Bytes:
-        """Return the texels [N, 4] of a picture."""
+        """Return the texels [N, 4] of picture number ``place`` of a section."""
         # writers round the width up, never by as much as this
         return self._picture(section, place, self._count, 2 * self._count + 4096).reshape(-1, 4)[: self._count]
 
