@@ -134,15 +134,15 @@ def test_rows_of_one_cell_hold_every_value(local: str, tmp_path: Path, monkeypat
     found: dict[int, tuple[_ReusedBounds, np.ndarray]] = {}
     if local == "short":
         monkeypatch.setattr(family_module, "_MOST_TRACED", 100)
-    borrowed = _ReusingCells._borrowed
+    borrowed = _ReusingCells._narrowed
 
     def watched(self: _ReusingCells, index: int, form: Any) -> Any:
         if index in self.first.stored:
             reference = form.reference.flatten(1).numpy()[:, self.first.stored[index].flat]
-            found[index] = self._said(index), reference
+            found[index] = self._stored_bounds(index), reference
         return borrowed(self, index, form)
 
-    monkeypatch.setattr(_ReusingCells, "_borrowed", watched)
+    monkeypatch.setattr(_ReusingCells, "_narrowed", watched)
     for seed in range(2):
         net, _ = network(tmp_path, seed, local)
         images = image_sets(SHAPE, 1, 2, 0.2, 1e-3, seed)
@@ -180,7 +180,7 @@ def test_products_of_rows_are_charged(local: str, tmp_path: Path) -> None:
         other.intermediate.image.offsets.reshape(m, 2, -1),
     )
     for index, lent in family._first.stored.items():
-        said = other._said(index)
+        said = other._stored_bounds(index)
         tilt, noise = np.zeros((m, len(lent.flat), 2)), other.intermediate.flush[:, None]
         low, high = (np.repeat(v[None], m, 0) for v in lent.fixed.T)
         if index in other.intermediate.relaxations[0].noise:
