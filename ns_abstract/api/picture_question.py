@@ -69,7 +69,7 @@ class PlaneSample:
     def signed_gradient_step(
         self, box: ParameterBox, values: np.ndarray, score: Score, size: float
     ) -> tuple[np.ndarray, PlaneSample]:
-        """See `SceneSample`; where weights or depths are scored it stays where it is."""
+        """Return values and a scene one signed gradient step on; weights and depths have no gradient and stay."""
         if not self.steps:
             return values, self
         values, moved = self.base.signed_gradient_step(box, values, score, size)
@@ -241,7 +241,7 @@ class PlanePictures(FramePictures):
         return KnownBoxes(self, weights, self.wanted, self._limited)
 
     def near(self, cell: ParameterBox) -> FrameImages:
-        """See `ns_abstract.verify.protocol.NearImages`."""
+        """Return the pictures and sets for poses of ``cell``, cheaper by bounds of a box around it."""
         pictures = None if self._boxes is None else self._boxes.near(cell)
         return self if pictures is None else pictures
 

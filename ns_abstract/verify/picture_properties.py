@@ -161,7 +161,7 @@ class PictureClaim(Claim):
         return _joined(self.statement, iter(lower), np.minimum, np.maximum).min(axis=1)
 
     def refuted(self, query: Query, bounds: OutputBounds, boxes: Sequence[ParameterBox]) -> np.ndarray:
-        """See `Claim.refuted` (docs/dev/design.md, Q8)."""
+        """Return upper bounds [m] of the margin over the cells ``boxes`` (docs/dev/design.md, Q8)."""
         # the value is at most -fall, and its negative at most -rise
         margins = [
             np.min([-fall - low] * math.isfinite(low) + [high - rise] * math.isfinite(high), axis=0)

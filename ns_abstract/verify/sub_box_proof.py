@@ -403,7 +403,7 @@ class SubBoxProof:
     def _cuts(
         self, cell: ParameterBox, root: ParameterBox, effects: np.ndarray | None, cost: float, always: bool = False
     ) -> tuple[int, ...]:
-        """Return numbers [d] of parts of a cell, at least two, such that each needs few enough sub-boxes.
+        """Return the numbers [d] of parts into which to cut a cell, so that each part needs few enough sub-boxes.
 
         A cut of the cell's own parameters also narrows other parameters of the sheared box: the cut is chosen after
         which the fewest sub-boxes are needed in all.

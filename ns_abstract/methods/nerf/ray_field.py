@@ -174,7 +174,7 @@ class BoundedRays(ABC):
 
     @abstractmethod
     def bounded(self, request: RayRequest, division: Division | None) -> RayBounds:
-        """See `rays`."""
+        """Return bounds of the requested rays; see `rays`."""
 
 
 class RayField(BoundedRays):

@@ -25,7 +25,10 @@ _SLOT = 6 * LANES
 
 @njit(cache=True, error_model="numpy")
 def directions_line(s, n, degree, low):
-    """Compute unit directions and their products from slots 0 to 2; ``low``: lower bounds of the squared lengths."""
+    """Compute unit directions and their products, as forms, from the vectors in slots 0 to 2 of the scratch ``s``.
+
+    ``low``: lower bounds of the squared lengths.
+    """
     for q in range(n):
         x, y, z = load(s, 0, LANES, q), load(s, _SLOT, LANES, q), load(s, 2 * _SLOT, LANES, q)
         length2 = combined(combined(multiplied(x, x), 1.0, multiplied(y, y), 1.0), 1.0, multiplied(z, z), 1.0)

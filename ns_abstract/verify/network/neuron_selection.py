@@ -70,9 +70,9 @@ class NeuronSelection:
         return self._refine_unstable(index, form, unstable, isinstance(layer, LeakyRelu))
 
     def _refine_curved(self, index: int, form: NodeForm, unstable: Tensor, gaps: Tensor) -> tuple[NodeForm, Tensor]:
-        """Refine some neurons of a curved activation; return the form and which others are worth refining (N6).
+        """Refine a sample of a curved activation's neurons; return the form, and the neurons worth refining (N6).
 
-        Lines that are close beside the form's width may be far gaps beside the width after refining.
+        A gap that is small relative to the form's width may be large relative to the width after refining.
         """
         usable = torch.from_numpy(self.intermediate.usable).reshape(-1, *[1] * (unstable.ndim - 1))
         likely = (gaps > _STRAIGHT) & ~unstable & usable

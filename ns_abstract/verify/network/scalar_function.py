@@ -144,7 +144,7 @@ class ScalarFunction(Activation):
     def _by_parts(
         self, work: Callable[[Tensor, Tensor], LinearRelaxation], lower: Tensor, upper: Tensor
     ) -> LinearRelaxation:
-        """Return ``work`` of many intervals, computed in cache-sized batches, linear pieces by themselves."""
+        """Return the relaxations ``work`` of many intervals in cache-sized batches, or the lines of linear pieces."""
         low, high = lower.reshape(-1), upper.reshape(-1)
         if any(self.bends):
             parts = [work(*ends) for ends in zip(low.split(_TOGETHER), high.split(_TOGETHER), strict=True)]

@@ -232,7 +232,7 @@ class NerfactoFrame(FieldFrame):
         super().__init__(pose_set, NerfactoRenderer(scene.field), bounds, _SHARE, at_once, workers)
 
     def _tried(self, calls: Sequence[Sequence[Any]]) -> list[RayBounds | None]:
-        """See `FieldFrame`; runs in threads."""
+        """Return bounds of rays by call, computed in threads; None: there was no time for a call."""
 
         def bounded(call: Sequence[Any]) -> RayBounds | None:
             try:
