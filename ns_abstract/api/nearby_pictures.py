@@ -234,7 +234,7 @@ class NearbyPictures:
         return shared_counts(self._motion * np.array(widths), most)
 
     def divided_sets(self, box: ParameterBox, counts: np.ndarray) -> tuple[PixelSets, SubBoxEnds | None]:
-        """Return linear sets of a cell, and bounds of its deciding pixels over ``counts`` [d] sub-boxes, or None (Q8)."""
+        """Return linear sets of a cell, and bounds of deciding pixels over ``counts`` [d] sub-boxes, or None (Q8)."""
         return self._sets(box, counts)
 
     def _sets(self, box: ParameterBox, counts: np.ndarray | None) -> tuple[PixelSets, SubBoxEnds | None]:

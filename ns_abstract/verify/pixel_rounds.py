@@ -105,7 +105,7 @@ class PixelRounds:
         self.take(self.photo.excluding(lower, upper, pixels), pixels)
 
     def take(self, excluding: np.ndarray, pixels: np.ndarray) -> None:
-        """Add to the counts which of ``n`` ``pixels`` exclude which sub-boxes: ``excluding`` [n, k], each pixel once."""
+        """Count which of ``n`` ``pixels`` exclude which sub-boxes: ``excluding`` [n, k], each pixel once."""
         fresh = (pixels & ~self.bounded)[pixels]
         excluding = excluding[fresh]
         more = excluding.sum(axis=0)

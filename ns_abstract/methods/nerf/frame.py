@@ -286,7 +286,7 @@ class FieldFrame(Frame):
         return parts
 
     def _tried(self, calls: Sequence[Sequence[Any]]) -> list[RayBounds | None]:
-        """Return bounds of rays by call (arguments of `rays`), one after another; None: there was no time for a call."""
+        """Return bounds of rays by call (arguments of `rays`), one by one; None: there was no time for a call."""
         parts: list[RayBounds | None] = []
         with suppress(WorkCancelledError):
             for call in calls:
