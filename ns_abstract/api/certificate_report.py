@@ -101,7 +101,7 @@ class CertificateReport:
 
     @cached_property
     def _standing(self) -> tuple[np.ndarray, np.ndarray]:
-        """Ends of a box of possible camera positions; the same for every report, so that the scene is drawn once."""
+        """Ends of a box of possible camera positions; equal in all reports, so that the scene is drawn once."""
         return standing(self._sets)
 
     @cached_property
@@ -118,7 +118,7 @@ class CertificateReport:
         return None if elements is None else SceneDrawing(elements)
 
     def _kept_image(self, frame: int, pose: np.ndarray) -> np.ndarray | None:
-        """Return the stored image of a counterexample."""
+        """Return the stored image of a counterexample at ``pose``; None where none is stored."""
         files = sorted((self.search.folder / IMAGES).glob(f"frame_{frame:05d}_*.npz"))
         return next((image for file in files if (image := _image_at(file, pose)) is not None), None)
 
@@ -279,7 +279,7 @@ class PoseRenderer:
         return PoseImage(title, values, png, outputs[0].tolist(), margin if np.isfinite(margin) else None)
 
     def right(self, region: FailureRegion, rows: CellRows, parameters: Sequence[Mapping[str, Any]]) -> PoseImage | None:
-        """Return the nearest certified pose; without one, the middle of a nearby cell where the network is right."""
+        """Return the nearest certified pose, or the middle of a near cell where the network is right; None: neither."""
         cells = rows[region.frame]
         for _, pose in broken.nearest(cells, "certified", region.pose, parameters):
             return self.look("nearest certified pose", region.frame, pose)

@@ -364,7 +364,7 @@ class Certification:
         return write_vnnlib(network, images, claim.rows, claim.offset, target, form, claim.groups, version)
 
     def partitions(self, grid: CellGrid) -> int | None:
-        """Return the number of parts of the fixed partition, if there is one."""
+        """Return the number of parts of the fixed partition; None without one."""
         return math.prod(grid.units) if self.property.partitions is not None else None
 
 

@@ -238,7 +238,7 @@ class NearbyPictures:
         return self._sets(box, counts)
 
     def _sets(self, box: ParameterBox, counts: np.ndarray | None) -> tuple[PixelSets, SubBoxEnds | None]:
-        """Sets over a cell, and bounds of the pixels that are not settled over ``counts`` [d] sub-boxes of it."""
+        """Return linear sets over a cell, and bounds of unsettled pixels over ``counts`` [d] sub-boxes, or None."""
         box_bounds, d = self._known, box.dimensions
         flat = [np.zeros((*box_bounds.lower.shape, d), np.float32) for _ in range(2)]
         lower, upper, slopes = box_bounds.lower.copy(), box_bounds.upper.copy(), np.zeros(d)
@@ -359,6 +359,6 @@ def place_sets(
     channels: Sequence[int],
     pixels: np.ndarray | None = None,
 ) -> None:
-    """Do `place` for the four arrays of a picture's linear bounds, its lower and its upper bounds."""
+    """Write the tiles of a picture's linear bounds, and of its lower and upper bounds, into whole pictures."""
     assert bounds.linear is not None
     place(wholes, (*bounds.linear, bounds.lower, bounds.upper), frame, tiles, channels, pixels)

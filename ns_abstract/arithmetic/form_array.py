@@ -192,7 +192,7 @@ class FormArray:
         return self._unary(reciprocal_square_root)
 
     def compose(self, f0, f1, f2_low, f2_high, f3) -> FormArray:
-        """Return the element-wise ``f(x)`` by the kernel `compose`; f0 to f3 as there, broadcast against ``shape``."""
+        """Return the element-wise ``f(x)`` by the kernel `compose`, whose f0 to f3 are broadcast against ``shape``."""
         values = np.empty((5, *self.shape))
         for row, value in enumerate((f0, f1, f2_low, f2_high, f3)):
             values[row] = value

@@ -291,7 +291,7 @@ def _is(word: str, kind: type) -> bool:
 
 
 def _value(detail: str) -> tuple[str, str] | None:
-    """Return the unusable word and the fix, from tyro's text on a value that cannot be parsed as numbers."""
+    """Return the unusable word and a fix, from tyro's text on a value that is no number; None for other texts."""
     quoted = re.search(r"(?:from|float:|base 10:|arguments:) (\[.*\]|'.*')", detail)
     words = re.findall(r"'([^']*)'", quoted[1]) if quoted else []
     expected = detail.split(" could be", maxsplit=1)[0]

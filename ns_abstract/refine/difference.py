@@ -181,7 +181,7 @@ class DifferenceFrame(Frame):
         return np.maximum(self.first.motion(box), self.second.motion(box))
 
     def depths(self) -> np.ndarray | None:
-        """Return depths of elements of A."""
+        """Return depths of elements of scene A; None where it has none."""
         return self.first.depths()
 
 

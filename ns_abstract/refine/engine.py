@@ -132,7 +132,7 @@ class Refinement:
         return self._result(self._work())
 
     def run_part(self) -> PartResult:
-        """Do `run` for tiles that are later joined with others."""
+        """Run the refinement of some tiles, and return their part of the frame's result."""
         return self._part_result(self._work())
 
     def proceed(self, goal: RefinementGoal) -> FrameResult:

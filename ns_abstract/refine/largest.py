@@ -220,7 +220,7 @@ class LargestDifference:
     def _bound(
         self, accepted: float, time_share: float, enough: Callable[[Refinement], bool] = lambda refinement: False
     ) -> None:
-        """Do one pass over the tiles above the accepted value, in a fraction of the time left, or until ``enough``."""
+        """Bound the tiles above the accepted value once, in a fraction of the time left, or until ``enough``."""
         # what is rounded up would stay above the accepted value
         camera, (least,) = self.frame.camera, outward(np.array([accepted]), np.zeros(1))[0]
         # nothing above the accepted value is to be left open; where it is 0, means are measured

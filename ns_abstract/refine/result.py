@@ -265,7 +265,7 @@ def _joined_trace(parts: Sequence[PartResult]) -> tuple[TracePoint, ...]:
 
 
 def _joined_views(parts: Sequence[SampleImages | None], order: NDArray[np.intp], camera: Any) -> SampleImages | None:
-    """Return the renders at poses that every part has rendered, in their common order."""
+    """Return whole renders at the poses that every part has rendered; None where a part has none."""
     available = [part for part in parts if part is not None]
     if len(available) < len(parts):
         return None
@@ -277,7 +277,7 @@ def _joined_views(parts: Sequence[SampleImages | None], order: NDArray[np.intp],
 
 
 def _joined_leaves(parts: Sequence[Leaves | None]) -> Leaves | None:
-    """Return all leaves, ordered by box and tile."""
+    """Return all parts' leaves, ordered by box and tile; None where a part has none."""
     available = [part for part in parts if part is not None]
     if len(available) < len(parts):
         return None

@@ -382,7 +382,7 @@ def _bars(
 
 
 def _least(rows: Sequence[Mapping[str, Any]], kind: str) -> int | None:
-    """Return the position of the cell of a verdict with the least margin; cells without a margin come last."""
+    """Return the position of the cell of a verdict with the least margin; None: there is no cell of it."""
     of_verdict = [k for k, row in enumerate(rows) if row["verdict"] == kind]
     return min(of_verdict, key=lambda k: math.inf if (m := rows[k].get("margin")) is None else m, default=None)
 

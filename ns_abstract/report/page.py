@@ -167,7 +167,7 @@ def _seen(trace: Sequence[Mapping[str, float]]) -> list[Mapping[str, float]]:
 
 
 def _curve(entry: Mapping[str, Any]) -> Markup | None:
-    """Return the plot of a frame's error against run time, both axes logarithmic; zeros are left out."""
+    """Return the plot of a frame's error against run time, both axes logarithmic; None where all errors are zero."""
     points = _thinned(_seen(entry["trace"]))
     outer = [(point["seconds"], point["mpg"]) for point in points if point["mpg"] > 0.0]
     inner = [(point["seconds"], point["mpg_witness"]) for point in points if point["mpg_witness"] > 0.0]
@@ -192,7 +192,7 @@ def _curve(entry: Mapping[str, Any]) -> Markup | None:
 
 
 def _path_curve(frames: Sequence[Mapping[str, Any]]) -> Markup | None:
-    """Return the plot of all frames' errors against the run time of each, with their mean."""
+    """Return the plot of all frames' errors against their run times, with the mean; None for a single frame."""
     traces = [thinned for entry in frames if len(thinned := _thinned(entry["trace"])) > 1]
     if len(traces) < 2:
         return None

@@ -288,7 +288,7 @@ def cell_at(
     values: Sequence[float],
     ends: tuple[NDArray[np.float64], NDArray[np.float64]] | None = None,
 ) -> Mapping[str, Any] | None:
-    """Return the cell that holds a pose; where several meet, a certified one, which includes its boundary.
+    """Return the cell that holds a pose, or None; where several meet, a certified one, which includes its boundary.
 
     ``ends``: those of the rows (`cell_ends`), to be passed where several poses are looked up.
     """

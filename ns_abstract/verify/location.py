@@ -195,7 +195,7 @@ class LocationSearch:
 
     @cached_property
     def moved_pictures(self) -> MovedPictures | None:
-        """Pictures near the middles of cells, for frames that bound pixels over sub-boxes."""
+        """Pictures near the middles of cells, for frames that bound pixels over sub-boxes; None for others."""
         frame = self.sub_box_frame
         if frame is None:
             return None

@@ -175,12 +175,12 @@ class SceneMargin:
 
     @property
     def failing(self) -> Trial | None:
-        """The trial with the smallest radius that is not certified."""
+        """The trial with the smallest radius that is not certified; None: all are."""
         return self._least("falsified", "unknown")
 
     @property
     def falsified(self) -> Trial | None:
-        """The trial with the smallest radius at which a scene breaks a certified cell."""
+        """The trial with the smallest radius at which a scene breaks a certified cell; None: at no radius."""
         return self._least("falsified")
 
     @property

@@ -125,7 +125,7 @@ Parametrisation = Callable[[ParameterBox], tuple[ParameterBox, Callable[[Paramet
 
 
 def own_parameters(box: ParameterBox) -> tuple[ParameterBox, Callable[[ParameterBox], ParameterBox | None]]:
-    """Return a cell in its own parameters (no change of parameters)."""
+    """Return a cell as it is, and the identity as the change of parameters."""
     return box, lambda part: part
 
 

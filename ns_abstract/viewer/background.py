@@ -147,7 +147,7 @@ class Background:
             self._start_missing_workers()
 
     def best(self, view: ViewRequest, seconds: float) -> Snapshot | None:
-        """Return the best known snapshot of ``view``; better bounds are requested.
+        """Return the best known snapshot of ``view``, or None, and request better bounds.
 
         Args:
             seconds: Time that the work on the view's own size may take.

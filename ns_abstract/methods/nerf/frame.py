@@ -104,7 +104,7 @@ _here: dict[bytes, NerfBounds] = {}
 
 
 def _bound_share(frame: bytes, bounds: tuple[Any, ...], displacement: float, arguments: Sequence[Any]) -> RayBounds:
-    """Do `BoundedRays.rays` in another process; ``bounds`` are the constructor's arguments."""
+    """Return `BoundedRays.rays` in a worker process; ``bounds`` are the constructor's arguments."""
     if frame not in _here:
         _here.clear()
         _here[frame] = NerfBounds(*bounds)

@@ -222,9 +222,9 @@ def _ranges(values, absolute, norming, low, high):
 
 @njit(cache=True, error_model="numpy")
 def _decide(poly, rho, box, grid, slope, size, which, neuron, found, low, high):
-    """Do `_certain` by the polynomials' ranges, which are stored in ``low`` and ``high`` [.] where the sign stays open.
+    """Settle neurons whose polynomials have a certain sign; return the number of the others, which are kept.
 
-    NaN stays open, and fails in `relu`.
+    ``low`` and ``high`` [.] receive the ranges of the others. NaN stays undecided, and fails in `relu`. See `_certain`.
     """
     even, odd = _degrees(grid)
     values = np.empty((2 * grid.points - 1, LANES))

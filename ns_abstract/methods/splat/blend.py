@@ -244,7 +244,7 @@ def flattened(polynomials, r, scratch, m):
 
 @njit(cache=True, error_model="numpy", forceinline=True)
 def blend_several(begin, end, fragments, palette, moves, polynomials, m, crossings, split):
-    """Do `blend_quadratic` for several parameters, or none (design.md, B7, B10).
+    """Composite a pixel's list entries for several parameters, or none (design.md, B7, B10); see `blend_quadratic`.
 
     Writes ``polynomials`` [m + bends, 4] with their curvature (see `flattened`).
     """

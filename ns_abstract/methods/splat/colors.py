@@ -128,7 +128,7 @@ def _direction_error(length, position_error, means, mean_radius, i, charges):
 
 @njit(cache=True, error_model="numpy", nogil=True)
 def _fixed_worker(counter_, scene, position, position_error, charges, colors):
-    """Do the chunks of Gaussians that no other thread has taken; see `fixed_colors`."""
+    """Compute `fixed_colors` of the chunks of Gaussians that no other thread has taken."""
     counter, count = pointer(counter_), scene.means.shape[0]
     means, mean_radius, magnitudes = borrowed(scene.means), borrowed(scene.mean_radius), borrowed(scene.magnitudes)
     shift_low, shift_high, sh = borrowed(scene.low), borrowed(scene.high), borrowed(scene.sh)
@@ -272,7 +272,7 @@ def _clamp_channel(form, channel, numbers, filled, scratch, scene, charges, shap
 
 @njit(cache=True, error_model="numpy", nogil=True)
 def _moving_worker(counter_, indices, scene, position, origin, position_error, charges, shape, colors):
-    """Do the chunks of Gaussians that no other thread has taken; see `moving_colors`."""
+    """Compute `moving_colors` of the chunks of Gaussians that no other thread has taken."""
     counter, n, m = pointer(counter_), indices.shape[0], shape.monomials
     # 0-2 direction, 16-18 channels; in between what `line_colors` keeps
     work_ = np.empty((19, m + 3, LANES))

@@ -59,7 +59,7 @@ def form_colors(w, rows, low, sh, weights, indices, degree, m):
 
 @njit(cache=True, error_model="numpy", forceinline=True)
 def _accumulate(w, target, form, weight, m):
-    """Do ``target += weight * form``, without the rows of sums."""
+    """Write ``target += weight * form``, without the rows of sums."""
     for k in range(m):
         store(w, target + 8 * k, fma(weight, load8(w, form + 8 * k), load8(w, target + 8 * k)))
     weight = abs(weight)

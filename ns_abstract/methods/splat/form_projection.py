@@ -89,7 +89,7 @@ def _pixels(w, a, z, ratio, focal, out, m):
 
 @njit(cache=True, error_model="numpy")
 def _lower(w, a, b, out, m):
-    """Do ``out -= a b``."""
+    """Write ``out -= a b``."""
     # the subtraction's own rounding, for what it starts from
     store(w, out + 8 * m, load8(w, out + 8 * m) + SUM_ROUNDING * magnitude(w, out, m))
     add_product(w, a, b, -1.0, out, m)

@@ -143,7 +143,7 @@ def _keep_drawn(lanes, pixels, number, k, fragments, stop):
 
 @njit(cache=True, error_model="numpy", forceinline=True)
 def _keep_alone(lanes, pixels, number, k, fragments, stop, live, dim, m):
-    """Do `_keep_drawn` for lanes that an early termination may hide (B6).
+    """Append a Gaussian's fragments, of certain order, in ``lanes`` that early termination may hide (B6).
 
     Returns ``live`` without the pixels that surely terminate, and ``dim`` with those that get too little light.
     """

@@ -95,7 +95,7 @@ def _borrowed_inputs(scene, poses, camera, rules, charges, shape):
 
 @njit(cache=True, error_model="numpy", nogil=True)
 def _stage_worker(counter_, candidates_, scene, poses, camera, rules, charges, shape, out, state_):
-    """Do the chunks of candidates that no other thread has taken; see `gaussian_stage`."""
+    """Compute `gaussian_stage` of the chunks of candidates that no other thread has taken."""
     counter, candidates, state = pointer(counter_), borrowed(candidates_), borrowed(state_)
     inputs = _borrowed_inputs(scene, poses, camera, rules, charges, shape)
     out = ProjectedGaussians(

@@ -70,7 +70,7 @@ def blend_most(behind, color, a_low, a_high):
 
 @njit(cache=True, error_model="numpy", forceinline=True)
 def _least_moved(behind, color, brightest, a_low, a_high, move):
-    """Do `blend_least` for a fragment that may be drawn behind some of those listed behind it (design.md, B12, O2, O3).
+    """Return `blend_least` of a fragment that may be drawn behind some that are listed behind it (B12, O2, O3).
 
     ``brightest`` bounds their colours, ``move`` is the change that the swap bound allows.
     """
@@ -80,7 +80,7 @@ def _least_moved(behind, color, brightest, a_low, a_high, move):
 
 @njit(cache=True, error_model="numpy", forceinline=True)
 def _most_moved(behind, color, darkest, a_low, a_high, move):
-    """Do `blend_most` for a fragment that may be drawn behind some of those listed behind it; see `_least_moved`."""
+    """Return `blend_most` of a fragment that may be drawn behind some of those listed behind it; see `_least_moved`."""
     front = blend_most(behind, color, a_low, a_high)
     return minimum(front + move, maximum(front, fma(a_high, max(0.0, color - darkest), behind)))
 
@@ -182,7 +182,7 @@ def _ordered_end(value, start, stop, channel, side, block, alphas):
 
 @njit(cache=True, error_model="numpy")
 def _blend_eight(begin, end, part, reordered, block, inputs, slopes):
-    """Do `blend_parts` for eight parts from ``part`` on; return the darkest and the brightest colour."""
+    """Bound list entries [begin, end) over eight parts from number ``part`` on; return darkest and brightest."""
     fragments, palette, moves, out = block.fragments, block.palette, block.reordering.moves, block.part_ends
     values, colors, forms = fragments.values, palette.values, palette.forms
     alphas = offset_by(out, PART_ENDS + 6 * inputs.shape.parts)

@@ -52,7 +52,7 @@ def _set_trivial(pixels, left, above, bounds, m):
 
 @njit(cache=True, error_model="numpy")
 def _set_trivial_parts(pixels, left, above, bounds):
-    """Do `_set_trivial` for the parts or sub-boxes of the cell, where these are requested."""
+    """Set the bounds of ``pixels`` to [0, 1] over the parts or sub-boxes of the cell, where these are requested."""
     while pixels != 0 and bounds.parts.shape[0] > 0:
         q = lowest_bit(pixels)
         pixels = signed(pixels & (pixels - 1))

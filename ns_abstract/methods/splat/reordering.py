@@ -92,7 +92,7 @@ def swap_bounds(pairs, slots, block):
 
 @njit(cache=True, error_model="numpy")
 def _interval_group(start, stop, behind, fragments, palette, moves, scratch):
-    """Do one step of the interval blend for list entries [start, stop) of open order (design.md, O2-O4).
+    """Blend list entries [start, stop) of open order over ``behind``, by intervals (design.md, O2-O4).
 
     Returns the tightest of the swap, hull and antichain bounds.
     """

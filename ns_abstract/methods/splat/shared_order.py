@@ -128,7 +128,7 @@ class SplatOrder:
     def bounds(
         self, box: ParameterBox, tile: int, pixels: np.ndarray, contexts: tuple[Any, Any]
     ) -> list[tuple[Bounds, Bounds]] | None:
-        """Return linear bounds of both scenes, once for every depth order that a pose of ``box`` may have."""
+        """Return linear bounds of both scenes by depth order that a pose of ``box`` may have; None: too many orders."""
         visible = []
         for frame, bounds, context in zip(self.frames, self._bounds, contexts, strict=True):
             bounds.ranks = None

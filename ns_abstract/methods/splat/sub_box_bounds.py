@@ -30,7 +30,7 @@ class SubBoxBounds(SplatBounds):
     """`SplatBounds` with bounds over sub-boxes; takes the same arguments."""
 
     def warm_up(self, camera: PinholeCamera, forms: PoseForms, counts: np.ndarray) -> None:
-        """Compile the kernels of `by_depth_ranges`; arguments are as there."""
+        """Compile the kernels of `by_depth_ranges`, whose arguments these are."""
         pixels = np.ones((1, self.side, self.side), bool)
         goals = np.full((pixels.size, 6), np.inf)
         self.by_depth_ranges(camera, forms, self.project(camera, forms), np.arange(1), pixels, counts, goals)

@@ -319,7 +319,7 @@ def _by_planes(columns, side, place, bounds, crossings, d):
 
 @njit(cache=True, error_model="numpy")
 def bound_part(columns, side, place, bounds, crossings, d):
-    """Do `_by_planes` at the corner that the blends point to, or where the planes point back; keep the tighter."""
+    """Compute `_by_planes` at the corner that the blends point to, or where the planes point back; keep the tighter."""
     rows, room = crossings.rows, crossings.room
     part = _restricted_rows(d)
     for k in range(d):

@@ -47,7 +47,7 @@ class CoefficientSource:
     def reuse_bounds(
         self, index: int, form: NodeForm, unstable: Tensor, gaps: Tensor | None, layer: Activation | None
     ) -> tuple[NodeForm, Tensor, Tensor | None]:
-        """Return bounds of node ``index``, its unstable neurons, and their relaxation gaps (see `NeuronSelection`)."""
+        """Return the form of node ``index``, tightened by reused coefficients, its unstable neurons and their gaps."""
         return form, unstable, gaps
 
     def trace(self, count: int) -> BackwardTrace | None:

@@ -164,7 +164,7 @@ class Convolution(WindowLayer):
         return parts.reshape(s * t * into, out, high // s, wide // t).flip(2, 3).contiguous()
 
     def _phases_for(self, value: Tensor) -> Tensor | None:
-        """Return `_parts` in the type of ``value``."""
+        """Return `_parts` of the weights in the type of ``value``, cached."""
         if value.dtype not in self._phases:
             self._phases[value.dtype] = self._parts(self.weight_for(value))
         return self._phases[value.dtype]

@@ -197,7 +197,7 @@ class NeuronSelection:
         return self.neuron_bounds.bounded(index, form, chosen, None, True, best.cut)
 
     def _target(self, form: NodeForm, products: float, layer: Activation | None) -> NeuronTarget | None:
-        """Return the stopping target for all neurons of a node, whose passes to the image take ``products`` (N17)."""
+        """Return the stopping target of all passes of a node, which take ``products``; None: they end at the image."""
         part = self.schedule.stopping_width(products)
         if not part:
             return None

@@ -81,7 +81,7 @@ def _binary(r: OnnxReader, node: onnx.NodeProto, a: Attributes) -> None:
 
 
 def intervals_of(constant: EnclosedConstant | None, shape: Shape | None = None) -> ConstantIntervals | None:
-    """Return the errors of an inexact constant, broadcast to an item or in the shape of weights."""
+    """Return an inexact constant's error intervals, broadcast to an item or to weights; None for an exact constant."""
     if constant is None:
         return None
     intervals = constant.doubts

@@ -46,7 +46,7 @@ class SplitNeurons:
     noise: Float64
 
     def __getitem__(self, rows: np.ndarray) -> SplitNeurons:
-        """Return the same for some rows."""
+        """Return the split neurons of some rows."""
         return replace(self, side=self.side[rows])
 
     def lagrangian_terms(self, multiplier: Float32) -> tuple[Float32, Float64]:

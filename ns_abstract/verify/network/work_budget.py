@@ -73,7 +73,7 @@ class WorkBudget:
         return routes[:_MOST_ROUTES], plan.rate
 
     def longest_affordable(self, index: int, count: int) -> BackwardRoute | None:
-        """Return the longest affordable route of ``count`` neurons of node ``index``, and spend its multiplications."""
+        """Return the longest affordable route of ``count`` neurons of node ``index``, or None, and spend its price."""
         best = None
         for route in self.costs.routes(index):
             if count * route.price < _SMALL_SHARE * self.left:
