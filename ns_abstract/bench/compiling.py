@@ -74,7 +74,7 @@ class _Recorder:
         self._locked.append(time.perf_counter())
 
     def unlock(self, _: Any) -> None:
-        """Record that it is released."""
+        """Record that LLVM's lock is released, and add the time to LLVM's."""
         since = self._locked.pop()
         if not self._locked:
             self._llvm += time.perf_counter() - since

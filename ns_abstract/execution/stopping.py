@@ -57,7 +57,7 @@ class StopRequest:
             self._last = before
 
     def say_last_words(self) -> None:
-        """Call the function of `last_words`; for whoever ends the process."""
+        """Call the function of `last_words`, just before the process is ended."""
         self._last()
 
     def handle(self, number: int, frame: FrameType | None) -> None:

@@ -154,7 +154,7 @@ class AbstractOutputs(_Base):
         self._problems: list[str] | None = None
 
     def start_evaluation(self) -> None:
-        """Parameters are final from now on: bounds may be worked out."""
+        """Allow abstract images from now on: the model's parameters change no more."""
         self._evaluating = True
 
     def abstract_source(self) -> Source | None:

@@ -291,7 +291,7 @@ class _Bisection:
         return low
 
     def attack(self, failing: Trial, cell: CertifiedBox) -> None:
-        """Try larger radii until a scene breaks the cell."""
+        """Double the radius of a failing trial until a scene breaks the cell, or the largest radius is reached."""
         radius = failing.radius
         for _ in range(_TUNING.doublings):
             if radius >= self.kind.largest:

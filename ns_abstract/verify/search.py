@@ -463,7 +463,7 @@ class Search:
         return min((margin - bound) / margin, _RANK_UNKNOWN)
 
     def _cuts(self, cell: CellSamples, bound: float | None) -> tuple[float, int]:
-        """Return how many times narrower parts should be for a proof, and the largest number of parts."""
+        """Return how many times narrower a cell's parts should be for a proof, and the largest number of parts."""
         if cell.broken:
             return 0.25, 4
         if bound is None:

@@ -268,7 +268,7 @@ def _argument(section: runs.RunConfig, name: str, key: str) -> int:
 def _proposals(
     run: runs.RunConfig, state: ModelState, arguments: list[dict[str, int]], factor: float
 ) -> tuple[ProposalField, ...]:
-    """Return the field of every round."""
+    """Return the proposal field of every round of sampling; ``arguments``: each field's options."""
     fields = []
     for i, one in enumerate(arguments):
         name, grid = f"proposal_networks.{i}", _proposal_grid(one)

@@ -262,7 +262,7 @@ def exponent_ends(m):
 
 @njit(cache=True, error_model="numpy", inline="always")
 def exponent_limit(shape):
-    """Return the column in a fragment of the exponent above which alpha is below the threshold (B4), see `EXPONENT`."""
+    """Return a fragment's column of the exponent beyond which its alpha is below the threshold (B4); see `EXPONENT`."""
     return exponent_ends(shape.monomials) + 5
 
 

@@ -140,7 +140,7 @@ def _interval_group(start, stop, behind, fragments, palette, moves, scratch):
 
 @njit(cache=True, error_model="numpy", forceinline=True)
 def _worth_reordering(begin, end, ends, form_low, form_high, fragments, forms, moves):
-    """Return whether O3 and O4 may tighten the bounds notably, where forms are not tighter anyway."""
+    """Return whether rules O3 and O4, for open depth orders, may tighten a pixel's bounds notably beyond its forms."""
     falls = 0.0 * ends.low
     rises = falls
     for entry in range(begin, end):

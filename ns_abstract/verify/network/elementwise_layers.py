@@ -241,7 +241,7 @@ class ElementwiseBuilder(NetworkBuilder):
         return x if factor == 1.0 else self.scale(x, np.asarray(factor), None)
 
     def _gated(self, value: int, gate: int) -> int:
-        """Add ``value gate`` as one activation; 0 if it is no known one."""
+        """Add ``value * gate`` as one activation (such as SiLU) and return its node; 0 if it is no known one."""
         root, s, o = self._affine(value)
         inner, factor, shift = self._affine(gate)
         node = self._node(inner)

@@ -23,7 +23,7 @@ def _flushed() -> bool:
 
 
 def _flushed_by_workers() -> bool:
-    """Return whether any of torch's worker threads does."""
+    """Return whether one of torch's worker threads flushes subnormal numbers to zero."""
     count = torch.get_num_threads()
     return count > 1 and bool((torch.full((count * _BY_THREAD,), FLUSH) * 0.5 == 0.0).any())
 

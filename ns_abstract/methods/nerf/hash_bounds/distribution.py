@@ -141,7 +141,7 @@ def _one_bin(light, count, edges, k, share, line, out, work):
 
 @njit(cache=True, error_model="numpy", **UNCOUNTED)
 def _slopes_of_bins(light, edges, first, past, line, work):
-    """Return the least and largest slope of positions in bins ``first`` to ``past`` (exclusive)."""
+    """Return the least and largest slope of the inverse distribution in bins ``first`` to ``past`` (exclusive)."""
     least, most = np.inf, 0.0
     for k in range(first, past):
         _, low, high = _bin(light, k, line, work)

@@ -77,7 +77,7 @@ def _hull(table, first, counts, low, high):
 
 @njit(cache=True, error_model="numpy", **UNCOUNTED)
 def _across(nodes, i, j, k, y, z, f):
-    """Return the value of a feature on the face ``i`` of nodes, at ``y`` and ``z`` from the node (j, k)."""
+    """Return a feature's value on face ``i`` of a grid of nodes, interpolated at ``y``, ``z`` from the node (j, k)."""
     a = nodes[i, j, k, f] + y * (nodes[i, j + 1, k, f] - nodes[i, j, k, f])
     b = nodes[i, j, k + 1, f] + y * (nodes[i, j + 1, k + 1, f] - nodes[i, j, k + 1, f])
     return a + z * (b - a)
