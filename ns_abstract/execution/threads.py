@@ -64,7 +64,7 @@ def use_threads(count: int) -> None:
 
 @lru_cache(maxsize=1)
 def _pool(process: int) -> ThreadPoolExecutor:
-    """Return the thread pool of a process; a fork has none of its own."""
+    """Return the thread pool of the process with this number, as a fork cannot use its parent's."""
     return ThreadPoolExecutor(max(1, most_threads() - 1), "kernels")
 
 

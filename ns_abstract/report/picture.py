@@ -299,9 +299,9 @@ def preview(image: NDArray[np.uint8], side: int) -> bytes:
 
 
 def previews(result: FrameResult, side: int) -> Mapping[str, bytes]:
-    """Return PNGs of a frame for the page: lower, upper, gap, gap of renders (same scale), render, further outputs.
+    """Return PNGs of a frame for the page, by name: lower, upper, gap, gap of renders (same scale), render, others.
 
-    Further outputs are named ``depth_lower`` and so on; their scale ends at the largest finite value.
+    The others are further outputs, named ``depth_lower`` and so on; their scale ends at the largest finite value.
     """
     top = max_pixel_gap(result.lower, result.upper)
     images = {

@@ -202,7 +202,7 @@ class ElementwiseBuilder(NetworkBuilder):
     # ------------------------------------------------------------ two values that depend on the image
 
     def spread(self, x: int, shape: Shape) -> int:
-        """Add the item broadcast along axes of length 1."""
+        """Add the item ``x``, broadcast to ``shape`` along axes of length 1, and return its node."""
         before = self.shape(x)
         if before == tuple(shape):
             return x

@@ -286,7 +286,7 @@ class Tangents:
         return self.first <= self.last
 
     def __getitem__(self, at: Tensor) -> Tangents:
-        """Return the tangents of some intervals, in one row."""
+        """Return the tangents of the intervals numbered ``at``, flattened."""
         parts = (self.first[at], self.last[at], self.lower[at], self.upper[at])
         return Tangents(self.curve, self.side, *parts, self.corners[:, at], self.values[:, at])
 
