@@ -114,7 +114,7 @@ class InitialPartition:
             count, before = 2 * count + 1, excess
 
     def _sampled_count(self, count: int, goal: RefinementGoal) -> int:
-        """Return an odd number of equal parts, at most twice ``count``, which leave sampled tiles little enough excess."""
+        """Return an odd number of equal parts, at most twice ``count``, for little enough excess in sampled tiles."""
         tuning, inner = self.tuning, self.inner
         random, tiles = np.random.default_rng(0), self.tiles
         places = np.sort(random.choice(tiles.count, tiles.count // tuning.tiles_a_sample, replace=False))

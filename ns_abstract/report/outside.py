@@ -166,7 +166,7 @@ def sideways(low: Float64, high: Float64, up: int = 2) -> tuple[int, int]:
 def about(
     outside: SceneDrawing | None, axes: tuple[int, int], low: Float64, high: Float64, nearest: float, width: int
 ) -> PlotWindow:
-    """Return a window on the scene that holds the box ``low``, ``high``; with no scene to draw, around the box alone."""
+    """Return a window on the scene that holds the box ``low``, ``high``; without a scene, around the box alone."""
     return framed(axes, low, high, width) if outside is None else outside.window(axes, low, high, nearest, width)
 
 

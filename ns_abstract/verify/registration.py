@@ -89,7 +89,7 @@ class RegisteredSample:
 
     @property
     def arrays(self) -> dict[str, np.ndarray]:
-        """Return the shift or turn of the scene as a whole, by name."""
+        """Return the offset of the scene as a whole, by name."""
         return {"place": self.offset}
 
 

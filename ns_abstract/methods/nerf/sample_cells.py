@@ -128,7 +128,7 @@ class SampleCellBounds:
         return (0.1 if self.owner.swept else 0.5) * self.tolerance
 
     def _level(self, level: int) -> tuple[Tensor, Tensor, np.ndarray]:
-        """Return monomials at the cells' nodes [cells, nodes, M], a Bernstein matrix [parts, b, m], `Division.members`."""
+        """Return monomials at all nodes [cells, nodes, M], a Bernstein matrix [parts, b, m], `Division.members`."""
         if level not in self._levels:
             low, high = self.division.boxes(level)
             nodes = 0.5 * (low + high)[:, None] + 0.5 * (high - low)[:, None] * self.basis.nodes
