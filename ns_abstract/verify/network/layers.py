@@ -66,7 +66,7 @@ class LinearLayer:
         return self.apply(inputs)
 
     def spare(self, sizes: Sequence[Tensor]) -> Tensor | float:
-        """Return float32 errors besides those of sums, for inputs of magnitude up to ``sizes`` [m, *input_shapes[i]]."""
+        """Return float32 errors besides those of sums, for inputs up to ``sizes`` [m, *input_shapes[i]]."""
         return 0.0
 
     def inexact(self, sizes: Sequence[Tensor]) -> Tensor | float:
