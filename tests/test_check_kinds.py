@@ -586,6 +586,10 @@ def test_headlines_are_those_of_the_cells() -> None:
     # a question of a loop that is answered for all of its cells
     loop = {"kind": "loop", "questions": dict.fromkeys(("safe", "reaches"), frame["coverage"]), "verdict": "safe"}
     assert _overall(loop, parts) == ["frame 1: no cells"]
+    # parts that are not shares of the set, and add up to 0
+    loop["questions"]["reaches"] = {"certified": 1.0, "falsified": -1.0, "unknown": 0.0}
+    assert _overall(loop, parts) == ["frame 1: no cells"]
+    loop["questions"]["reaches"] = frame["coverage"]
     both = [*parts, dataclasses.replace(parts[0], index=1)]
     assert _overall(loop | {"verdict": "reaches"}, both) == []
     broken = [parts[0], dataclasses.replace(parts[0], index=1, verdicts=[("falsified", None, [0.0])])]

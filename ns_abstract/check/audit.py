@@ -50,7 +50,9 @@ def open_result(folder: Path, moved: dict[str, Path | None]) -> tuple[list[str],
 def _overall(report: dict[str, Any], parts: list[StoredCells], frames: Collection[int] | None = None) -> list[str]:
     """Return contradictions of the report's verdict and coverage to the cells, ``parts``, and the frames asked for."""
     entries, kinds = entries_of(report), {c.index: {v[0] for v in c.verdicts or ()} for c in parts}
-    wrong = [f"frame {k}: no cells" for k, e in entries.items() if k not in kinds and e["certified"] + e["falsified"]]
+    wrong = [
+        f"frame {k}: no cells" for k, e in entries.items() if k not in kinds and (e["certified"] or e["falsified"])
+    ]
     for kind, said in (report.get("coverage") or {}).items():
         if not abs(sum(e[kind] for e in entries.values()) / len(entries) - said) <= 1e-9:
             wrong.append(f"the report says {said:.9g} of all sets are {kind}, its frames do not")
@@ -61,9 +63,7 @@ def _overall(report: dict[str, Any], parts: list[StoredCells], frames: Collectio
         verdict = ("safe", "reaches")[whole[-1]]
     elif report.get("kind") != "loop" and len(whole) == len(report["frames"]) == len(frames or entries):
         verdict = "certified"
-    if report["verdict"] != verdict:
-        wrong.append(f"the verdict is {verdict}, the report says {report['verdict']}")
-    return wrong
+    return wrong + [f"the verdict is {verdict}, the report says {report['verdict']}"] * (report["verdict"] != verdict)
 
 
 def settle_claims(subjects: list[Claims], claims: int, seconds: float, seed: int) -> Iterator[ClaimOutcome]:
